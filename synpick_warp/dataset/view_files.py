@@ -141,9 +141,10 @@ class SceneFiles(ABC):
         """An `image`, with its channels and type checked; see `check_planes`."""
         return check_planes(self.image(name, frame), channels, f"{name} of image {frame} in {self.place}", dtype)
 
-    def image_file(self, name: str, frame: int) -> tuple[str, bytes, str]:
-        """Suffix, content and path of an image's file; raises DatasetError unless its header has the scene's size. `name`: of `image`."""
-        suffix, data, source = self._need(name, frame)
+    def image_file(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str]:
+        """Suffix, content and path of an image's or mask's file; raises DatasetError unless its header has the scene's size. `name`: of
+        `image`, or "mask" or "mask_visib"."""
+        suffix, data, source = self._need(name, frame, index)
         if (stated := image_size(data)) != self.image_size(frame):
             there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
             raise DatasetError(f"{source} {there}")

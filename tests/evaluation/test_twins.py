@@ -1,24 +1,18 @@
-"""Twins of annotated images: what they change, what they keep, and appearance of known pixels."""
+"""Twins of annotated images: what they change, what they keep, and runs that are interrupted or refused."""
 
+import json
 import re
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.apps.evaluation.twins import Appearance, measure_appearance
+from synpick_warp.apps.evaluation import twins
+from synpick_warp.apps.evaluation.twins import RECORD, write_twins
 from tests.builders import mistake, run
-
-
-def test_appearance_of_known_pixels():
-    color = np.zeros((40, 40, 3), np.uint8)
-    color[:, 20:] = 255, 0, 0
-    whole = np.ones((40, 40), bool)
-    assert measure_appearance(color, whole)[:2] == pytest.approx((1 / 6, 1 / 6))
-    assert measure_appearance(color, whole).saturation == pytest.approx(0.5)
-    assert measure_appearance(color, np.arange(40) > 30 + 0 * whole) == pytest.approx(Appearance(1 / 3, 0.0, 1.0, 0.0), abs=1e-5)
 
 
 def test_twins_differ_in_the_pixels_of_objects_alone(picked_set, tmp_path):
@@ -26,19 +20,25 @@ def test_twins_differ_in_the_pixels_of_objects_alone(picked_set, tmp_path):
     out = tmp_path / "twins"
     code, text, error = run("gap", picked_set, "--out", out, "--device", "cpu", "--set", "render.exposure=2.0")
     assert code == 0, error
-    real, twins = synpick_warp.open(picked_set), synpick_warp.open(out)
+    real, made = synpick_warp.open(picked_set), synpick_warp.open(out)
     files = {path.relative_to(out): path for path in out.rglob("*") if path.is_file()}
+    record = [json.loads(line) for line in files.pop(Path(RECORD)).read_text().splitlines()]
     assert files.keys() == {path.relative_to(picked_set) for path in picked_set.rglob("*") if path.is_file()}
     changed = {str(name.parent.name) for name, path in files.items() if path.read_bytes() != (picked_set / name).read_bytes()}
     assert changed == {"rgb"}
     brighter = 0
-    for image, twin in zip(real.views(), twins.views(), strict=True):
+    for image, twin in zip(real.views(), made.views(), strict=True):
         shown = image.masks.any(axis=0)
         far = np.abs(image.rgb.astype(int) - twin.rgb).max(axis=2) > 40  # JPEG rings by less.
         assert not (far & ~shown).any()
         brighter += int((twin.rgb[shown].astype(int) - image.rgb[shown]).mean() > 20) if shown.any() else 0
     assert brighter > 1
-    assert text.count("\n") == 2 + len({int(index) for view in real.views() for index in view.object_ids})
+    assert text.count("\n") == 3 + len({int(index) for view in real.views() for index in view.object_ids})
+    likeness = [one for image in record for one in image["objects"]]
+    assert len(record) == sum(len(view) > 0 for view in real.views())
+    assert {Path(image["image"]) for image in record} <= files.keys()
+    assert min(one["geometry"] for one in likeness) > 0.98  # Rendered from the poses of the images' own renderings.
+    assert all(0.0 < one["score"] < 1.0 for one in likeness)
 
 
 def test_twins_of_a_sensor_stand_where_its_images_do(picked_set, tmp_path):
@@ -62,6 +62,7 @@ def test_twins_of_a_sensor_stand_where_its_images_do(picked_set, tmp_path):
     assert code == 0, error
     assert "images without cam_R_w2c are taken as upright" in error
     made = {path.relative_to(tmp_path / "a" / "twins"): path for path in (tmp_path / "a" / "twins").rglob("*") if path.is_file()}
+    del made[Path(RECORD)]
     assert {real / name for name in made} == before.keys()
     assert all(path.read_bytes() == data for path, data in before.items())
     changed = [path for name, path in made.items() if path.read_bytes() != before[real / name]]
@@ -70,16 +71,92 @@ def test_twins_of_a_sensor_stand_where_its_images_do(picked_set, tmp_path):
     assert {cv2.imread(str(path), cv2.IMREAD_UNCHANGED).ndim for path in changed} == {2}
 
 
+def small_set(picked_set: Path, folder: Path) -> Path:
+    """Scene folder of a data set of one split and scene, from another source."""
+    shutil.copytree(picked_set / "models", folder / "models")
+    return shutil.copytree(next(picked_set.glob("*/000000/rgb")).parent, folder / "test" / "000000")
+
+
+def test_a_killed_run_goes_on_where_it_was(picked_set, tmp_path, monkeypatch):
+    """After twins of half of the images, with the next image's file and line cut off: what is there stays, and the result is that of one
+    run. Other settings start anew, and leave the first run's work alone."""
+    small_set(picked_set, tmp_path / "real")
+    real, settings = synpick_warp.open(tmp_path / "real"), synpick_warp.load_config(None, {"bake.device": "cpu", "render.table": False})
+    whole = write_twins(real, tmp_path / "whole", settings, note=lambda text: None)
+    views = len((tmp_path / "whole" / RECORD).read_text().splitlines())
+    monkeypatch.setattr(twins, "BATCH_PIXELS", 1)
+
+    def kill(label: str, done: int, count: int) -> None:
+        if done == views // 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_twins(real, tmp_path / "twins", settings, kill, lambda text: None)
+    (part,) = tmp_path.glob(".twins-*")
+    assert not (tmp_path / "twins").exists()
+    with (part / RECORD).open("ab") as record:
+        record.write(b'{"image":"te')
+    done = [part / json.loads(line)["image"] for line in (part / RECORD).read_text().splitlines()[:-1]]
+    before = {path: path.stat().st_mtime_ns for path in done}
+    torn = next(path for path in sorted((part / "test" / "000000" / "rgb").iterdir()) if path not in done)
+    torn.unlink()
+    torn.write_bytes(b"torn")
+    other = settings.with_values({"render.exposure": 2.0})
+    with pytest.raises(KeyboardInterrupt):
+        write_twins(real, tmp_path / "twins", other, kill, lambda text: None)
+    counts = []
+    assert write_twins(real, tmp_path / "twins", settings, lambda *state: counts.append(state[1]), lambda text: None) == whole
+    assert counts == list(range(views // 2 + 1, views + 1))
+    assert {path: (tmp_path / "twins" / path.relative_to(part)).stat().st_mtime_ns for path in done} == {**before}
+    for path in (tmp_path / "whole").rglob("*"):
+        assert path.is_dir() or path.read_bytes() == (tmp_path / "twins" / path.relative_to(tmp_path / "whole")).read_bytes()
+    assert len(list(tmp_path.glob(".twins-*"))) == 1
+
+
+def test_images_keep_their_channels_and_bits(picked_set, tmp_path):
+    """The first image with 16 bits, the second with opacity: objects have the twin's 8 bits, all else stays."""
+    scene = small_set(picked_set, tmp_path / "real")
+    names = sorted((scene / "rgb").iterdir())
+    stored = {}
+    for number, path in enumerate(names):
+        image = cv2.imread(str(path))
+        path.unlink()
+        if number == 0:
+            image = image.astype(np.uint16) * 256 + 7
+        if number == 1:
+            image = np.dstack([image, np.full(image.shape[:2], 99, np.uint8)])
+        stored[path.with_suffix(".png").name] = image
+        cv2.imwrite(str(path.with_suffix(".png")), image)
+    code, _, error = run("gap", tmp_path / "real", "--out", tmp_path / "twins", "--device", "cpu")
+    assert code == 0, error
+    assert error.count("images of 16 bits a channel are taken as sRGB over their whole range") == 1
+    for number, (name, image) in enumerate(stored.items()):
+        twin = cv2.imread(str(tmp_path / "twins" / "test" / "000000" / "rgb" / name), cv2.IMREAD_UNCHANGED)
+        assert (twin.shape, twin.dtype) == (image.shape, image.dtype)
+        changed = (twin != image).any(axis=2)
+        assert changed.any() or number > 1  # In the last one no object is left.
+        assert number or (twin[changed] % 257 == 0).all()
+        assert number != 1 or (twin[..., 3] == 99).all()
+
+
 def test_what_has_no_twins_is_one_line(picked_set, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     assert "allowed: a new or an empty folder" in mistake("gap", picked_set, "--out", tmp_path / "full")
     assert "is not a data set" in mistake("gap", tmp_path / "full", "--out", tmp_path / "new")
-    shutil.copytree(picked_set / "models", tmp_path / "real" / "models")
-    scene = shutil.copytree(next(picked_set.glob("*/000000/rgb")).parent, tmp_path / "real" / "test" / "000000")
+    scene = small_set(picked_set, tmp_path / "real")
     truth = (scene / "scene_gt.json").read_text()
     (scene / "scene_gt.json").write_text(re.sub(r'("cam_R_m2c": ?\[)[^]]*', r"\g<1>1, 0, 0, 0, 1, 0, 0, 0, -1", truth))
     assert "cam_R_m2c that is no rotation" in mistake("gap", tmp_path / "real", "--out", tmp_path / "new", "--device", "cpu")
+    (scene / "scene_gt.json").write_text(truth)
+    for damaged in (sorted((scene / "rgb").iterdir())[-1], sorted((scene / "mask_visib").iterdir())[-1]):
+        content = damaged.read_bytes()
+        damaged.write_bytes(b"no image")
+        assert f"{damaged} is not an image" in mistake("gap", tmp_path / "real", "--out", tmp_path / "new", "--device", "cpu")
+        damaged.unlink()
+        assert f"there is no {damaged.with_suffix('')}" in mistake("gap", tmp_path / "real", "--out", tmp_path / "new", "--device", "cpu")
+        damaged.write_bytes(content)
+    assert {path.name for path in tmp_path.iterdir()} == {"full", "real"}
     (scene / "scene_gt.json").unlink()
     (scene / "scene_gt_info.json").unlink()
     assert "no image with objects" in mistake("gap", tmp_path / "real", "--out", tmp_path / "new")

@@ -2,13 +2,14 @@
 
 import json
 import shutil
+from argparse import Namespace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
 
-import synpick_warp
 from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.schema import Config
 from tests.builders import FEW_STEPS, PICKING, assignments, refusal
@@ -18,7 +19,7 @@ from tools.bench import peers, worlds
 from tools.compare import __main__ as compare
 from tools.compare import pictures
 from tools.reports.real.frames import read_frames
-from tools.reports.real.twins import compare_objects, render_frame
+from tools.reports.real.twins import compare_objects, render_frames
 
 PICKS = {key: value for key, value in PICKING.items() if key.startswith(("perception.", "pick."))}
 SHORT_PICKS = (*FEW_STEPS, *assignments(PICKS | {"pick.speed": 4.0, "pick.lift_speed": 2.0, "settle.rest_displacement": 1e-3}))
@@ -109,8 +110,10 @@ def test_a_twin_differs_in_its_objects_alone(frames, tmp_path):
     """A box of 66 x 66 x 50 mm, whose front is 27.8 px wide: it covers the pixels that the photograph labels."""
     trimesh.creation.box((66.0, 66.0, 50.0)).export(tmp_path / "obj_000021.ply")
     (frame,) = read_frames(frames)
-    settings = synpick_warp.load_config(None, {"bake.device": "cpu", "render.table": False, "render.coarse_paths": 1})
-    twin = render_frame(frame, tmp_path, settings)
+    options = Namespace(models=str(tmp_path), lights="", device="cpu", set=["render.coarse_paths=1"])
+    empty = replace(frame, object_ids=(), rotations=frame.rotations[:0], translations=frame.translations[:0])
+    unchanged, twin = render_frames([empty, frame], options)
+    assert unchanged is empty
     np.testing.assert_array_equal(twin.label, frame.label)
     np.testing.assert_array_equal(twin.color[frame.label == 0], frame.color[frame.label == 0])
     rows = {row.name.removeprefix("obj_id 21: "): row.value for row in compare_objects([frame], [twin])}

@@ -2,30 +2,39 @@
 (as in cut-and-paste augmentation: Dwibedi, Misra and Hebert, ICCV 2017).
 
 Image and twin differ in the objects' appearance alone: materials, light, the camera's tone. What a network loses from twins to images is
-therefore the appearance gap; what it lacks on twins has other causes. Without a network, tone and detail are compared object by object.
+therefore the appearance gap; what it lacks on twins has other causes. Without a network, `likeness` compares them object by object.
 """
 
+import hashlib
+import os
 import shutil
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
+import msgspec
 import numpy as np
 
+from synpick_warp._version import __version__
+from synpick_warp.apps.evaluation.likeness import DEPTH_TOLERANCE, Likeness, compare_geometry, compare_objects, find_features
 from synpick_warp.codes import MAX_INSTANCES
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.bop.layout import find_models
 from synpick_warp.dataset.commit.merge import link_file
+from synpick_warp.dataset.commit.writing import lock_folder
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.dataset.view_files import SceneFolder
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import output_errors
-from synpick_warp.online.render import render_scene
+from synpick_warp.online.render import SceneRenderer
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.inputs.files import make_folder
+from synpick_warp.system.inputs.image_files import decode_picture
 from synpick_warp.system.linear_algebra import det, is_orthonormal
 from synpick_warp.system.progress import Report, ignore_progress
 
@@ -35,42 +44,74 @@ JPEG_QUALITY = 95
 """Quality of twins of JPEG images."""
 UPRIGHT = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """World to camera where a data set does not say it: up in the image is up."""
-_LEVELS = 255.0
+BATCH_PIXELS = 2**21
+"""Pixels that are rendered at once."""
+RECORD = "gap.jsonl"
+"""File of the twins with a line for each image: its path, and the likeness of its objects."""
 _ROTATION = "cam_R_w2c"
 _TURNED = f"images without {_ROTATION} are taken as upright: light comes from above in them"
 _HIDDEN = "without mask_visib, objects are drawn over what hides them"
+_DEEP = "images of 16 bits a channel are taken as sRGB over their whole range; twins of these have 16 bits, of which 8 are rendered"
+_WIDER = 257
+"""Largest value of 16 bits, as a multiple of that of 8."""
+_DIGITS = 12
 
 
-class Appearance(NamedTuple):
-    """Statistics of an object's sRGB pixels, in 0..1: mean and standard deviation of grey values, mean saturation (of HSV), and standard
-    deviation of grey values less those blurred by 1 px (texture, sharpening, noise)."""
+@dataclass(frozen=True)
+class ImageRecord:
+    """Line of RECORD: path of an image, relative to the data set, and the likeness of each of its objects."""
 
-    brightness: float
-    contrast: float
-    saturation: float
-    detail: float
+    image: str
+    objects: list[Likeness]
 
 
-def measure_appearance(color: np.ndarray, mask: np.ndarray) -> Appearance:
-    """Appearance of the pixels of a mask (H, W) bool, at least one, in an image (H, W, 3) uint8."""
-    values = color.astype(np.float32) / _LEVELS
-    grey, high, low = values.mean(axis=2), values.max(axis=2), values.min(axis=2)
-    detail, saturation = grey - cv2.GaussianBlur(grey, (0, 0), 1.0), (high - low) / np.maximum(high, 1.0 / _LEVELS)
-    numbers = grey[mask].mean(), grey[mask].std(), saturation[mask].mean(), detail[mask].std()
-    return Appearance(*map(float, numbers))
+class Shot(NamedTuple):
+    """Annotated image, of which a twin is rendered."""
+
+    source: Any
+    """What it is made of."""
+    color: np.ndarray
+    """(H, W, 3) uint8."""
+    objects: list[tuple[Path, np.ndarray]]
+    """Model file [mm], and object to world (4, 4) [m], of each, at least one."""
+    camera: Camera
+    shown: np.ndarray | None = None
+    """Where objects are visible in the image (H, W) bool; None: wherever they are rendered."""
 
 
-def render_twin(
-    color: np.ndarray, objects: Sequence[tuple[Path, np.ndarray]], camera: Camera, settings: Config, shown: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Twin (H, W, 3) uint8 of an image, in which outlines stay as they are, and the number of the object that each pixel shows (H, W)
-    uint8, from 1; 0: none. `objects`: model file [mm], and object to world (4, 4) [m], of each, at least one; `shown` (H, W) bool: where
-    objects are visible in the image; None: wherever they are rendered. Raises SynpickError: a model or a setting cannot be used."""
-    views = render_scene(objects, [camera], (), UNIT, settings.bake.device, settings)
-    instance = views["instance"].numpy()[0]
-    if shown is not None:
-        instance = np.where(shown, instance, 0).astype(np.uint8)
-    return np.where(inner_pixels(instance)[..., None], views["color"].numpy()[0], color), instance
+class Twin(NamedTuple):
+    """Twin of an image."""
+
+    shot: Shot
+    color: np.ndarray
+    """(H, W, 3) uint8; the image's own pixels at outlines and beyond, and grey if the image is."""
+    instance: np.ndarray
+    """Number of the object that each pixel shows (H, W) uint8, from 1; 0: none."""
+    depth: np.ndarray
+    """Planar depth (H, W) float32 [m]; 0: no object."""
+
+
+def render_twins(shots: Iterable[Shot], renderer: SceneRenderer) -> Iterator[Twin]:
+    """Render the twins of images by a renderer of their models, in batches of images of one size."""
+    batch = list[Shot]()
+    for shot in shots:
+        if batch and (shot.color.shape != batch[0].color.shape or len(batch) * shot.color[..., 0].size >= BATCH_PIXELS):
+            yield from _render_batch(batch, renderer)
+            batch = []
+        batch.append(shot)
+    if batch:
+        yield from _render_batch(batch, renderer)
+
+
+def _render_batch(shots: Sequence[Shot], renderer: SceneRenderer) -> Iterator[Twin]:
+    views = renderer.render([shot.objects for shot in shots], [shot.camera for shot in shots])
+    scale = np.float32(UNIT * renderer.settings.bop.depth_scale)
+    for shot, color, instance, depth in zip(shots, *(views[name].numpy() for name in ("color", "instance", "depth")), strict=True):
+        instance = instance if shot.shown is None else np.where(shot.shown, instance, 0).astype(np.uint8)
+        twin = np.where(inner_pixels(instance)[..., None], color, shot.color)
+        if (shot.color == shot.color[..., :1]).all():
+            twin = cv2.cvtColor(cv2.cvtColor(twin, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
+        yield Twin(shot, twin, instance, depth * scale)
 
 
 def inner_pixels(instance: np.ndarray) -> np.ndarray:
@@ -80,73 +121,143 @@ def inner_pixels(instance: np.ndarray) -> np.ndarray:
 
 def write_twins(
     data_set: DataSet, out: Path, settings: Config, report: Report = ignore_progress, note: Callable[[str], object] = print
-) -> dict[int, tuple[Appearance, Appearance]]:
+) -> list[Likeness]:
     """Write the twins of all views of a data set, or of one split, in BOP's folders to the new folder `out`, with all else but other splits
-    as links or copies. Returns the mean appearance of each obj_id in images and in twins, inside of outlines, over the views that show it.
-    `note` receives what is assumed. Raises SynpickError: there are no objects, files are missing or damaged, or a setting cannot be used;
-    then there is no folder."""
-    scenes, wanted, count, out = dict[tuple[int, int], SceneFolder](), set[int](), 0, out.resolve()
-    remarks = set[str]()
-    for view in data_set.views():
-        if (key := (view.episode, view.camera)) not in scenes:
-            scene = data_set.scene_files(*key)
-            if not isinstance(scene, SceneFolder):
-                raise DatasetError(f"{scene.place} is a shard; twins are made of data sets in folders: synpick-warp convert")
-            scenes[key] = scene
+    as links or copies, and RECORD. Returns the likeness of the objects of all views. What an interrupted run has written stays in a hidden
+    folder beside `out`; the next one with the same data and settings goes on there. `note` receives what is assumed. Raises SynpickError:
+    there are no objects, files are missing or damaged, or a setting cannot be used; headers and annotations are read before any work."""
+    out, root, note = out.resolve(), data_set.folder, cache(note)
+    splits, names, wanted, camera = _check_inputs(data_set, note)
+    models = find_models(root, wanted, "twins are rendered")
+    files = {index: path for index, (path, _) in models.items()}
+    tolerances = {index: None if info.diameter is None else DEPTH_TOLERANCE * info.diameter for index, (_, info) in models.items()}
+    renderer = SceneRenderer(list(files.values()), [camera], (), UNIT, settings.bake.device, settings)
+    states = [(path, path.stat().st_size, path.stat().st_mtime_ns) for path in files.values()]
+    content = repr((__version__, root.resolve(), names, states, config_to_toml(settings)))
+    work = out.with_name(f".{out.name}-{hashlib.sha256(content.encode()).hexdigest()[:_DIGITS]}")
+    with output_errors(out):
+        make_folder(work)
+        lock, made = lock_folder(work), dict[str, list[Likeness]]()
+        try:
+            made |= _read_record(work / RECORD)
+            _link_files(root, work, splits, made.keys() | {RECORD})
+            shots = (_make_shot(view, files) for view in _views(data_set) if names.get(_key(view), RECORD) not in made and len(view))
+            with (work / RECORD).open("ab", buffering=0) as record:
+                for twin in render_twins(shots, renderer):
+                    name = names[_key(twin.shot.source)]
+                    _replace(work / name, twin, note)
+                    found = _compare(twin, tolerances)
+                    record.write(msgspec.json.encode(ImageRecord(name, found)) + b"\n")
+                    made[name] = found
+                    report("views", len(made), len(names))
+            work.chmod(root.stat().st_mode)
+            work.rename(out)
+        except BaseException:
+            if not made:
+                shutil.rmtree(work, ignore_errors=True)
+            raise
+        finally:
+            os.close(lock)
+    return [one for objects in made.values() for one in objects]
+
+
+def _views(data_set: DataSet) -> Iterator[View]:
+    """Views camera by camera, whose images have one size mostly; made anew each time, as a view keeps the images that were read."""
+    return (view for episode in data_set.values() for camera in episode.cameras for view in episode.views(camera))
+
+
+def _key(view: View) -> tuple[int, int, int]:
+    return view.episode, view.camera, view.image_id
+
+
+def _check_inputs(data_set: DataSet, note: Callable[[str], object]) -> tuple[set[Path], dict[tuple[int, int, int], str], set[int], Camera]:
+    """Folders of the splits; path of the image of each view with objects; their obj_ids; and one of the cameras. Raises DatasetError: there
+    are no objects, an image or mask is missing or no image of its camera's size, or annotations cannot be used."""
+    splits, names, wanted, remarks, camera = set[Path](), dict[tuple[int, int, int], str](), set[int](), set[str](), None
+    for view in _views(data_set):
+        scene = data_set.scene_files(view.episode, view.camera)
+        if not isinstance(scene, SceneFolder):
+            raise DatasetError(f"{scene.place} is a shard; twins are made of data sets in folders: synpick-warp convert")
         if len(view) > MAX_INSTANCES:
             raise DatasetError(f"{view.place}: image {view.image_id} has {len(view)} objects; allowed: {MAX_INSTANCES}")
+        splits.add(scene.folder.parent)
+        source = Path(scene.image_file("rgb", view.image_id)[2])
+        if _has_depth(view):
+            scene.image_file("depth", view.image_id)
+        for index in range(len(view) if view.has("mask_visib") else 0):
+            scene.image_file("mask_visib", view.image_id, index)
+        if len(view):
+            names[_key(view)], camera = str(source.relative_to(data_set.folder)), _place(view)[0]
         remarks |= {text for known, text in ((_ROTATION in view.records.camera, _TURNED), (view.has("mask_visib"), _HIDDEN)) if not known}
-        wanted, count = wanted | set(view.object_ids.tolist()), count + 1
-    if not wanted:
+        wanted |= set(view.object_ids.tolist())
+    if camera is None:
         raise DatasetError(f"{data_set.folder} has no image with objects in its scene_gt.json, so none has a twin")
-    models = find_models(data_set.folder, wanted, "twins are rendered")
     for text in sorted(remarks):
         note(text)
-    found: dict[int, list[tuple[Appearance, Appearance]]] = {}
-    root, own = data_set.folder, {scene.folder.parent for scene in scenes.values()}
-    others = {path.parent.parent for path in root.glob("*/*/scene_*.json")} - own
-    with output_errors(out):
-        make_folder(out.parent)
-        part = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-        try:
-            for path in sorted(root.rglob("*")):
-                if others.isdisjoint(path.parents) and (path.is_symlink() or not path.is_dir()):
-                    link_file(path, part / path.relative_to(root))
-            for done, view in enumerate(data_set.views(), 1):  # Made anew: a view keeps the images that were read.
-                suffix, _, source = scenes[view.episode, view.camera].image_file("rgb", view.image_id)
-                if len(view):
-                    twin, pairs = _make_twin(view, [models[int(index)][0] for index in view.object_ids], settings)
-                    _replace(part / Path(source).relative_to(root), suffix, twin)
-                    for index, pair in pairs:
-                        found.setdefault(index, []).append(pair)
-                report("views", done, count)
-            part.chmod(root.stat().st_mode)
-            part.rename(out)
-        except BaseException:
-            shutil.rmtree(part, ignore_errors=True)
-            raise
-    means = {index: np.mean(pairs, axis=0).tolist() for index, pairs in sorted(found.items())}
-    return {index: (Appearance(*real), Appearance(*twin)) for index, (real, twin) in means.items()}
+    return splits, names, wanted, camera
 
 
-def _make_twin(view: View, models: Sequence[Path], settings: Config) -> tuple[np.ndarray, list[tuple[int, tuple[Appearance, Appearance]]]]:
-    """Twin (H, W, 3) uint8 of a view, grey if the image is; obj_id and appearance in both of each object that it shows."""
-    placed, color = view.world_to_camera if _ROTATION in view.records.camera else UPRIGHT, view.rgb
+def _has_depth(view: View) -> bool:
+    return view.has("depth") and "depth_scale" in view.records.camera
+
+
+def _read_record(path: Path) -> dict[str, list[Likeness]]:
+    """Likeness of the objects of each image that an earlier run has finished; a line that it has not is cut off."""
+    lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+    path.write_bytes(b"".join(line + b"\n" for line in lines))
+    records = [msgspec.json.decode(line, type=ImageRecord) for line in lines]
+    return {record.image: record.objects for record in records}
+
+
+def _link_files(root: Path, work: Path, splits: set[Path], others: Collection[str]) -> None:
+    """Link all files of a data set but those of other splits, and some `others`, into a folder."""
+    absent = {path.parent.parent for path in root.glob("*/*/scene_*.json")} - splits
+    for path in sorted(root.rglob("*")):
+        name = str(path.relative_to(root))
+        if name not in others and absent.isdisjoint(path.parents) and (path.is_symlink() or not path.is_dir()):
+            (work / name).unlink(missing_ok=True)
+            link_file(path, work / name)
+
+
+def _place(view: View) -> tuple[Camera, np.ndarray]:
+    """Camera of a view, and object to world (N, 4, 4) [m]."""
     if not all(is_orthonormal(pose) and det(pose) > 0 for pose in view.object_to_camera[:, :3, :3]):
         raise DatasetError(f"{view.place}: an object of image {view.image_id} has a cam_R_m2c that is no rotation")
+    placed = view.world_to_camera if _ROTATION in view.records.camera else UPRIGHT
     camera = Camera(*view.size, np.asarray(view.intrinsics), placed[:3, :3], placed[:3, 3], lens=view.lens)
-    shown = np.logical_or.reduce(view.masks) if view.has("mask_visib") else None
-    objects = zip(models, np.linalg.inv(placed) @ view.object_to_camera, strict=True)
-    twin, instance = render_twin(color, list(objects), camera, settings, shown)
-    if (color == color[..., :1]).all():
-        twin = cv2.cvtColor(cv2.cvtColor(twin, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
-    masks = [(int(index), (instance == number) & inner_pixels(instance)) for number, index in enumerate(view.object_ids, 1)]
-    return twin, [(index, (measure_appearance(color, mask), measure_appearance(twin, mask))) for index, mask in masks if mask.any()]
+    return camera, np.linalg.inv(placed) @ view.object_to_camera
 
 
-def _replace(target: Path, suffix: str, twin: np.ndarray) -> None:
-    """Replace a link to an image by its twin (H, W, 3) uint8; the image itself, which has the same data, stays."""
-    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix.startswith(".j") else []
+def _make_shot(view: View, models: Mapping[int, Path]) -> Shot:
+    camera, poses = _place(view)
+    objects = [(models[int(index)], pose) for index, pose in zip(view.object_ids, poses, strict=True)]
+    return Shot(view, view.rgb, objects, camera, np.logical_or.reduce(view.masks) if view.has("mask_visib") else None)
+
+
+def _compare(twin: Twin, tolerances: Mapping[int, float | None]) -> list[Likeness]:
+    """Likeness of the objects of a view that it shows; `tolerances`: of depth, by obj_id [m]; None: depth is not compared."""
+    view, inner = twin.shot.source, inner_pixels(twin.instance)
+    masks, depth = view.masks if view.has("mask_visib") else [None] * len(view), view.depth if _has_depth(view) else None
+    features, found = [find_features(color) for color in (twin.shot.color, twin.color)], list[Likeness]()
+    for number, (index, mask) in enumerate(zip(view.object_ids.tolist(), masks, strict=True), 1):
+        shown = twin.instance == number
+        geometry = compare_geometry(shown, twin.depth, mask, depth, tolerances[index])
+        if (pixels := shown & inner).any() or (geometry == 0.0 and mask is not None and mask.any()):
+            found.append(compare_objects(index, features[0][pixels], features[1][pixels], geometry))
+    return found
+
+
+def _replace(target: Path, twin: Twin, note: Callable[[str], object]) -> None:
+    """Replace a link to an image by its twin, with the channels and bits of the image; the image itself, which has the same data, stays."""
+    stored, inner = decode_picture(target.read_bytes(), target, DatasetError), inner_pixels(twin.instance)
+    values = twin.color[..., ::-1][inner].astype(stored.dtype)
+    if stored.dtype == np.uint16:
+        note(_DEEP)
+        values *= _WIDER
+    if stored.ndim == 2:
+        stored[inner] = values[:, 0]
+    else:
+        stored[..., :3][inner] = values
+    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if target.suffix.lower().startswith(".j") else []
     target.unlink()
-    stored = twin[..., 0] if target.parent.name.startswith("gray") else twin[..., ::-1]
-    target.write_bytes(cv2.imencode(suffix, stored, quality)[1].tobytes())
+    target.write_bytes(cv2.imencode(target.suffix, stored, quality)[1].tobytes())

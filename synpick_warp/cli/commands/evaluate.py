@@ -3,8 +3,10 @@ prints the command of the BOP toolkit for BOP's own scores."""
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
+import statistics
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -325,7 +327,8 @@ def estimate(
 
 def write_gap(data: Path, out: Path, split: str | None, settings: Config) -> int:
     """Write twins of a data set, or of one split, and print how its objects look in both; returns the exit code."""
-    from synpick_warp.apps.evaluation.twins import Appearance, write_twins
+    from synpick_warp.apps.evaluation.likeness import Appearance, average
+    from synpick_warp.apps.evaluation.twins import RECORD, write_twins
     from synpick_warp.cli.display import count_on_stderr
 
     data = find_data_set(data, "synpick-warp gap DIR")
@@ -333,10 +336,14 @@ def write_gap(data: Path, out: Path, split: str | None, settings: Config) -> int
     check_output_file(out, "--out", data, is_folder=True)
     with count_on_stderr() as counter:
         found = write_twins(open_split(data, split), out, settings, counter.report, lambda line: print(escape(line), file=sys.stderr))
-    print("obj_id", *(f"{name:>16}" for name in Appearance._fields), "   (image, twin)")
-    for index, pair in found.items():
-        print(f"{index:>6}", *(f"{real:>9.3f} {twin:>6.3f}" for real, twin in zip(*pair, strict=True)))
-    print(f"twins: {escape(str(out))}; the scores of one network on both differ by what the objects' appearance costs")
+    scores, means, none = ("appearance", "geometry", "score"), average(found), Appearance(*[math.nan] * len(Appearance._fields))
+    print("obj_id", *(f"{name:>16}" for name in Appearance._fields), *(f"{name:>10}" for name in scores), "  (image, twin; likeness)")
+    for row in means:
+        pairs = (f"{real:>9.3f} {twin:>6.3f}" for real, twin in zip(row.image or none, row.twin or none, strict=True))
+        print(f"{row.obj_id:>6}", *pairs, *(f"{getattr(row, name):>10.3f}" for name in scores))
+    total = {name: statistics.fmean(getattr(row, name) for row in means) for name in scores}
+    print(f"likeness, mean of the objects: {total['score']:.3f} (appearance {total['appearance']:.3f}, geometry {total['geometry']:.3f})")
+    print(f"twins: {escape(str(out))}, likeness by image in {RECORD}; the scores of one network on both differ by what appearance costs")
     return 0
 
 

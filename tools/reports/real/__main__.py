@@ -38,7 +38,7 @@ from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run, write_run
 from tools.options import MeasuredRow, configure, existing_folder, fail, make_parser, number_in, positive_count, print_rows
 from tools.reports.real.frames import RealFrame, read_frames
-from tools.reports.real.twins import render_twins
+from tools.reports.real.twins import render_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
 """Episodes to train on, and to measure on."""
@@ -261,7 +261,7 @@ def main(arguments: list[str] | None = None) -> int:
 def run(options: argparse.Namespace, frames: list[RealFrame], device: Any) -> None:
     """Train and score with all seeds of a command line; results are written after each, and printed. Raises SynpickError: a setting is
     wrong, models or lights cannot be used, or files cannot be written."""
-    config, twins = settings_of(options, 0, device), render_twins(frames, options)
+    config, twins = settings_of(options, 0, device), render_frames(frames, options)
     few, held = replace(config, bake=replace(config.bake, worlds=min(options.worlds, FEW_WORLDS))), ViewPool(HELD_OUT_VIEWS, 0)
     held.fill(stream_views(few, HELD_OUT, HELD_OUT_VIEWS), HELD_OUT_VIEWS)
     check_ids([*(frame.label for frame in frames), held.tensors()[1].cpu().numpy()])

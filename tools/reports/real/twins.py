@@ -17,46 +17,53 @@ import numpy as np
 from rich.console import Console
 
 import synpick_warp
-from synpick_warp.apps.evaluation.twins import UNIT, Appearance, inner_pixels, measure_appearance, render_twin
+from synpick_warp.apps.evaluation.likeness import Appearance, find_features, measure_appearance
+from synpick_warp.apps.evaluation.twins import UNIT, Shot, Twin, inner_pixels, render_twins
 from synpick_warp.configs.files.load import parse_assignment
-from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, SynpickError
+from synpick_warp.online.render import SceneRenderer
 from synpick_warp.scenes.types import Camera
 from tools.figures import describe_run, write_run
 from tools.options import MeasuredRow, existing_folder, fail, make_parser, print_rows
 from tools.reports.real.frames import RealFrame, read_frames
 
 
-def render_twins(frames: Sequence[RealFrame], options: argparse.Namespace) -> list[RealFrame]:
-    """Twins of frames by a command line's `models`, `lights`, `device` and `set`. Raises SynpickError: one of these cannot be used."""
+def render_frames(frames: Sequence[RealFrame], options: argparse.Namespace) -> list[RealFrame]:
+    """Twins of frames, and their labels, by a command line's `models`, `lights`, `device` and `set`. Raises SynpickError: one of these
+    cannot be used."""
     if not options.models:
         raise ConfigError("twins need --models, the folder of the photographs' BOP models")
     given = dict(parse_assignment(text) for text in options.set) | {"bake.lights": options.lights, "bake.device": options.device}
     settings = synpick_warp.load_config(None, given | {"render.table": False})
-    return [render_frame(frame, Path(options.models), settings) for frame in frames]
+    if not (shots := [_make_shot(frame, Path(options.models)) for frame in frames if frame.object_ids]):
+        return list(frames)
+    meshes = sorted({path for shot in shots for path, _ in shot.objects})
+    twins = render_twins(shots, SceneRenderer(meshes, [shots[0].camera], (), UNIT, options.device, settings))
+    return [_with_twin(frame, next(twins)) if frame.object_ids else frame for frame in frames]
 
 
-def render_frame(frame: RealFrame, models: Path, settings: Config) -> RealFrame:
-    """Twin of a frame, and its labels. `models`: folder of BOP models. Raises SynpickError: a model or a setting cannot be used."""
-    if not frame.object_ids:
-        return frame
+def _with_twin(frame: RealFrame, twin: Twin) -> RealFrame:
+    return replace(frame, color=twin.color, label=np.array([0, *frame.object_ids], np.uint8)[twin.instance])
+
+
+def _make_shot(frame: RealFrame, models: Path) -> Shot:
+    """Frame of one object or more, to render. `models`: folder of BOP models."""
     view = np.linalg.inv(np.vstack([frame.world_to_camera, [0.0, 0.0, 0.0, 1.0]]))
     poses = np.tile(np.eye(4), (len(frame.object_ids), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = frame.rotations, UNIT * frame.translations
     objects = [(models / f"obj_{index:06d}.ply", view @ pose) for index, pose in zip(frame.object_ids, poses, strict=True)]
-    camera = Camera.at(matrix=frame.intrinsics, resolution=frame.label.shape[::-1], pose=view)
-    color, instance = render_twin(frame.color, objects, camera, settings)
-    return replace(frame, color=color, label=np.array([0, *frame.object_ids], np.uint8)[instance])
+    return Shot(frame, frame.color, objects, Camera.at(matrix=frame.intrinsics, resolution=frame.label.shape[::-1], pose=view))
 
 
 def compare_objects(frames: Sequence[RealFrame], twins: Sequence[RealFrame]) -> list[MeasuredRow]:
     """Appearance of each object in photographs and twins, over the pixels that show it in both, as means over the frames."""
     found: dict[int, list[np.ndarray]] = {}
     for frame, twin in zip(frames, twins, strict=True):
+        features = [find_features(one.color) for one in (frame, twin)]
         for index in set(frame.object_ids):
             real, rendered = frame.label == index, twin.label == index
             if (both := real & rendered & inner_pixels(twin.label)).any():
-                pair = np.transpose([measure_appearance(one.color, both) for one in (frame, twin)])
+                pair = np.transpose([measure_appearance(each[both]) for each in features])
                 found.setdefault(index, []).append(np.append(pair, (real & rendered).sum() / (real | rendered).sum()))
     names = [f"{name}, {where}" for name in Appearance._fields for where in ("photograph", "twin")] + ["masks: IoU"]
     return [
@@ -74,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         frames = read_frames(options.real)
-        twins = render_twins(frames, options)
+        twins = render_frames(frames, options)
     except SynpickError as error:
         return fail("reports.real.twins", error)
     for frame, twin in zip(frames, twins, strict=True):
