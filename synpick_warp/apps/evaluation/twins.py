@@ -9,7 +9,6 @@ import hashlib
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,8 +56,7 @@ _WIDER = 257
 _DIGITS = 12
 
 
-@dataclass(frozen=True)
-class ImageRecord:
+class ImageRecord(msgspec.Struct):
     """Line of RECORD: path of an image, relative to the data set, and the likeness of each of its objects."""
 
     image: str
@@ -153,7 +151,9 @@ def write_twins(
             work.chmod(root.stat().st_mode)
             work.rename(out)
         except BaseException:
-            if not made:
+            if made:
+                note(f"{len(made)} twins are kept in {work}; the same command goes on there")
+            else:
                 shutil.rmtree(work, ignore_errors=True)
             raise
         finally:
@@ -174,8 +174,9 @@ def _check_inputs(data_set: DataSet, note: Callable[[str], object]) -> tuple[set
     """Folders of the splits; path of the image of each view with objects; their obj_ids; and one of the cameras. Raises DatasetError: there
     are no objects, an image or mask is missing or no image of its camera's size, or annotations cannot be used."""
     splits, names, wanted, remarks, camera = set[Path](), dict[tuple[int, int, int], str](), set[int](), set[str](), None
+    scene_files = cache(data_set.scene_files)
     for view in _views(data_set):
-        scene = data_set.scene_files(view.episode, view.camera)
+        scene = scene_files(view.episode, view.camera)
         if not isinstance(scene, SceneFolder):
             raise DatasetError(f"{scene.place} is a shard; twins are made of data sets in folders: synpick-warp convert")
         if len(view) > MAX_INSTANCES:
