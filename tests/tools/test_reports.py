@@ -19,7 +19,7 @@ from tools.bench import peers, worlds
 from tools.compare import __main__ as compare
 from tools.compare import pictures
 from tools.reports.real.frames import read_frames
-from tools.reports.real.twins import compare_objects, render_frames
+from tools.reports.real.twins import render_frames
 
 PICKS = {key: value for key, value in PICKING.items() if key.startswith(("perception.", "pick."))}
 SHORT_PICKS = (*FEW_STEPS, *assignments(PICKS | {"pick.speed": 4.0, "pick.lift_speed": 2.0, "settle.rest_displacement": 1e-3}))
@@ -116,7 +116,4 @@ def test_a_twin_differs_in_its_objects_alone(frames, tmp_path):
     assert unchanged is empty
     np.testing.assert_array_equal(twin.label, frame.label)
     np.testing.assert_array_equal(twin.color[frame.label == 0], frame.color[frame.label == 0])
-    rows = {row.name.removeprefix("obj_id 21: "): row.value for row in compare_objects([frame], [twin])}
-    assert (rows["masks: IoU"], rows["contrast, photograph"]) == (1.0, 0.0)
-    assert rows["brightness, photograph"] == pytest.approx(20 / 255, abs=1e-3) != rows["brightness, twin"]
-    assert rows["saturation, photograph"] == pytest.approx(2 / 3, abs=1e-3)
+    assert (twin.color[25, 35] != frame.color[25, 35]).any()

@@ -3,25 +3,12 @@
 import warp as wp
 
 from synpick_warp.kernels.newton_patches.broad_phase import synchronize_block
+from synpick_warp.kernels.newton_patches.contact_matching import find_pair
 
 wp.set_module_options({"enable_backward": False})
 
 FIRST_BODY = wp.constant(wp.int64(32))
 """Bits of a key below its first body, which counts from 1."""
-
-
-@wp.func
-def find_first(keys: wp.array[wp.int64], count: int, limit: wp.int64) -> int:
-    """Binary search: number of the first `count` keys that are below `limit`; they come first."""
-    low = int(0)
-    high = count
-    while low < high:
-        middle = (low + high) // 2
-        if keys[middle] < limit:
-            low = middle + 1
-        else:
-            high = middle
-    return low
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -38,8 +25,8 @@ def sort_contacts_kernel(
     """
     world, thread = wp.tid()
     capacity = key_inout.shape[0] // 2
-    first = find_first(key_inout, capacity, wp.int64(world * bodies + 1) << FIRST_BODY)
-    end = find_first(key_inout, capacity, wp.int64((world + 1) * bodies + 1) << FIRST_BODY)
+    first = find_pair(key_inout, capacity, wp.int64(world * bodies + 1) << FIRST_BODY)
+    end = find_pair(key_inout, capacity, wp.int64((world + 1) * bodies + 1) << FIRST_BODY)
     for contact in range(first + thread, end, wp.block_dim()):
         key = key_inout[contact]
         rank = first
