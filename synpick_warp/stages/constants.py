@@ -215,16 +215,8 @@ def bin_data(
     device: wp.Device,
     fields: Sequence[HeightField | None] = (),
 ) -> structs.BinData:
-    """Fill `BinData` but for the arrays of worlds.
-
-    Args:
-        sizes: The bins.
-        bins: Settings of their place.
-        move: Settings of the waypoints.
-        parts: The collision shapes of the bins in a world.
-        device: Device of the arrays.
-        fields: Height field of the inside of each bin; None, or none at all: it is a box.
-    """
+    """Fill `BinData` but for the arrays of worlds. `bins`: settings of their place. `move`: settings of the waypoints. `parts`: the
+    collision shapes of the bins in a world. `fields`: height field of the inside of each bin; None, or none at all: it is a box."""
     fields = fields or [None] * len(sizes)
     shape = next((one.limit.shape for one in fields if one), (1, 1))
 

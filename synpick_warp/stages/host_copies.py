@@ -50,14 +50,8 @@ def choose_transfers(bop: Bop, height: int, device: wp.Device, needs_images: boo
     On the CPU nothing is left out: the arrays are the host's. For an exporter that needs all images, only masks stay on the device. Else
     files and run boundaries replace images; of those lower than MIN_LISTED_ROWS only depth, since lists of run boundaries, capped at the
     size of an image, may overflow, and fetching the image then stalls. Depth files are made on every device: their bytes are the same.
-
-    Args:
-        bop: Settings of the files.
-        height: Rows of an image [px].
-        device: Device of the rendering.
-        needs_images: Whether an exporter reads all images.
-        depth_files: Whether an exporter writes depth files.
-    """
+    `height`: rows of an image [px]. `needs_images`: whether an exporter reads all images. `depth_files`: whether an exporter writes depth
+    files."""
     if not device.is_cuda:
         return TransferSettings(depth_files=depth_files)
     if needs_images:

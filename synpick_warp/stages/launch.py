@@ -48,16 +48,10 @@ def launch(
     """Launch a kernel with arguments by the names of its parameters, without their suffixes `_out` and `_inout`.
 
     The argument of a struct parameter that no source has is the `ArrayGroup` of this struct, or a bundle of the sources' attributes.
-
-    Args:
-        kernel: The kernel.
-        dim: Number of threads.
-        sources: Objects with attributes of these names, such as groups of device arrays; each name is that of one of them.
-        out: Object with the parameters that end in `_out`; None: they are looked for like the others.
-        block_dim: Threads of a block on the GPU.
-        given: Arguments that no object has under the parameter's name, by this name, with or without suffix.
-
-    Raises TypeError: no source has an argument, or several have it, or an argument is none of the kernel's."""
+    `dim`: number of threads. `sources`: objects with attributes of these names, such as groups of device arrays; each
+    name is that of one of them. `out`: object with the parameters that end in `_out`; None: they are looked for like the others.
+    `block_dim`: threads of a block on the GPU. `given`: arguments that no object has under the parameter's name, by this name, with or
+    without suffix. Raises TypeError: no source has an argument, or several have it, or an argument is none of the kernel's."""
     arguments = _find_arguments(kernel, sources, out, given)
     device = next(array.device for array in _arrays(arguments))
     wp.launch(kernel_for(kernel, *arguments), dim=dim, inputs=arguments, device=device, block_dim=block_dim)

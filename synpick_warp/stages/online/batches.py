@@ -333,16 +333,9 @@ class BatchRing:
         last: Mapping[str, np.ndarray],
         wide: bool = False,
     ) -> ViewBatch:
-        """Render views into the next slot, whose last batch must have expired.
-
-        Args:
-            snapshot: State of the worlds.
-            world: World of each view (B) int32, at most `views`.
-            camera: Camera of each view (B) int32.
-            host: For `ViewBatch.host`.
-            last: Their cameras in the tick before, as in `ViewExtrinsics`.
-            wide: As of `ViewRing.launch`.
-        """
+        """Render views into the next slot, whose last batch must have expired. `world`: world of each view (B) int32, at most `views`.
+        `camera`: camera of each view (B) int32. `host`: for `ViewBatch.host`. `last`: their cameras in the tick before, as in
+        `ViewExtrinsics`. `wide`: as of `ViewRing.launch`."""
         slot, cameras, count = self.slots[self._next], self._cameras[self._next], len(world)
         self._next = (self._next + 1) % len(self.slots)
         slot.gate.wait_for_consumers()

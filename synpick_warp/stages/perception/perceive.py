@@ -72,16 +72,10 @@ class GraspPlanner:
         self._contours = (self.views, self.instances, int(occlusion_votes.CONTOUR_LANES))
 
     def plan(self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int) -> None:
-        """Write votes and clutter graph to `observation`, target and grasp to `plan`, for the worlds of the batch.
-
-        Args:
-            scene: Constants.
-            state: State of the worlds.
-            attempts: State of the attempts; failed attempts, and the `outcome` of the one that ended in this tick, change the choice.
-            observation: Visibility, grasp points and depths are read; point and depth of targets may change.
-            plan: Written; in a world without a visible instance only the target, to -1.
-            seed: Seed of the random choice of targets and grasp points.
-        """
+        """Write votes and clutter graph to `observation`, target and grasp to `plan`, for the worlds of the batch. `attempts`: state of the
+        attempts; failed attempts, and the `outcome` of the one that ended in this tick, change the choice. `observation`: visibility, grasp
+        points and depths are read; point and depth of targets may change. `plan`: written; in a world without a visible instance only the
+        target, to -1. `seed`: seed of the random choice of targets and grasp points."""
         self.bound_contours(scene, state, observation)
         self.count_votes(scene, observation)
         self.weigh_votes(scene, observation)

@@ -225,16 +225,9 @@ class DenoisedRenderer:
         views: int,
         histories: int = 0,
     ) -> None:
-        """Allocate scratch.
-
-        Args:
-            render: Render settings: `mode` fast or unoccluded, `coarse_pixel`, `coarse_paths`, `bounces`, `history` and `antialias`.
-            seed: Seed of the data set.
-            scene: Constant data.
-            instances: Instance capacity of a world.
-            views: Capacity of a batch.
-            histories: Worlds times cameras whose light is averaged over frames; 0: each frame by itself.
-        """
+        """Allocate scratch. `render`: render settings: `mode` fast or unoccluded, `coarse_pixel`, `coarse_paths`, `bounces`, `history` and
+        `antialias`. `seed`: seed of the data set. `views`: capacity of a batch. `histories`: worlds times cameras whose light is averaged
+        over frames; 0: each frame by itself."""
         size = coarse_size(render, scene.width, histories)
         sizes = {"view": views} | scratch_sizes(render, scene.width, scene.height, histories)
         self.scene = scene

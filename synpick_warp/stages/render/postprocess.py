@@ -72,17 +72,10 @@ class PostProcessor:
     def __init__(
         self, effects: Effects, tone: str, seed: int, scene: RenderScene, views: int, kept_row: wp.array | None = None, kept: int = 0
     ) -> None:
-        """Allocate scratch, if an effect needs it.
-
-        Args:
-            effects: Ranges of the camera effects.
-            tone: Tone curve, a setting of `render.tone`.
-            seed: Seed of the bake.
-            scene: Constant data.
-            views: Largest number of views in a batch.
-            kept_row: (view) int32: indices of the kept images of a batch's views; None: nothing is kept.
-            kept: Number of images that are kept from frame to frame, for tiles that are not computed anew.
-        """
+        """Allocate scratch, if an effect needs it. `effects`: ranges of the camera effects. `tone`: tone curve, a setting of `render.tone`.
+        `seed`: seed of the bake. `views`: largest number of views in a batch. `kept_row`: (view) int32: indices of the kept images of a
+        batch's views; None: nothing is kept. `kept`: number of images that are kept from frame to frame, for tiles that are not computed
+        anew."""
         self.scene = scene
         sizes = {"kept": kept, "row": scene.height, "column": scene.width}
         self.kept, self.rows = allocate(KeptColors, sizes, scene.device).color, kept_row if kept else None

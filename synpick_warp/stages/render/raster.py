@@ -47,19 +47,9 @@ class Rasterizer:
     def __init__(
         self, scene: RenderScene, counts_per_meter: float, views: int, instances: int = 0, background: Any = None, kept: int = 0
     ) -> None:
-        """Allocate scratch.
-
-        Args:
-            scene: Constant data.
-            counts_per_meter: Counts of the depth image per metre.
-            views: Maximum number of views of a batch.
-            instances: Instance capacity of a world.
-            background: As the attribute; None: it is rendered.
-            kept: Number of views whose visibility and masks are kept from frame to frame.
-
-        Raises:
-            CatalogError: A mesh has more triangles than a visibility key can hold.
-        """
+        """Allocate scratch. `counts_per_meter`: counts of the depth image per metre. `background`: as the attribute; None: it is rendered.
+        `kept`: number of views whose visibility and masks are kept from frame to frame. Raises CatalogError: a mesh has more triangles than
+        a visibility key can hold."""
         most = max((len(mesh.indices) // 3 for mesh in scene.keep), default=0)
         if most > MAX_TRIANGLES:
             raise CatalogError(f"a mesh has {most} triangles; at most {MAX_TRIANGLES} can be rendered")

@@ -52,20 +52,10 @@ class Renderer:
         histories: int = 0,
         colors: bool = True,
     ) -> None:
-        """Allocate scratch.
-
-        Args:
-            scene: Constant data.
-            settings: Settings of the renderer.
-            effects: Settings of the camera effects.
-            depth_sensor: Settings of the simulated depth camera.
-            seed: Seed of all random numbers.
-            depth_scale: Millimetres per count of the depth image.
-            instances: Instance capacity of a world, at most `MAX_INSTANCES`.
-            views: Maximum number of views of a batch.
-            histories: Worlds times cameras whose light is averaged over the frames of an episode; 0: each frame is rendered by itself.
-            colors: Whether colour images are wanted; else they stay as they are, and nothing is shaded.
-        """
+        """Allocate scratch. `seed`: seed of all random numbers. `depth_scale`: millimetres per count of the depth image. `instances`:
+        instance capacity of a world, at most `MAX_INSTANCES`. `histories`: worlds times cameras whose light is averaged over the frames of
+        an episode; 0: each frame is rendered by itself. `colors`: whether colour images are wanted; else they stay as they are, and nothing
+        is shaded."""
         self.props = PropPlacer(scene, instances)
         bodies = self.props.bodies
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(bodies, scene.width, scene.height)

@@ -430,19 +430,11 @@ def build_render_scene(
     looks: Looks | None = None,
     cup_radius: float = schema.Suction().radius,
 ) -> RenderScene:
-    """Put all constant data of the renderer on the device.
-
-    Args:
-        settings: Settings of the renderer.
-        table_height: z of the table, on which the first bin stands [m].
-        catalog: The objects; `Snapshot.catalog_index` is the index into it. Its props are the meshes behind them.
-        fixtures: Bins, then gripper shaft and cup, each in its own frame.
-        cameras: Cameras of one image size; `Views.camera` is the index into it.
-        lights: Environment maps; `Snapshot.light` is the index into it.
-        device: Device of the arrays.
-        looks: What episodes draw their looks from; None: nothing.
-        cup_radius: Radius of the suction cup of the layers `suction_seal` and `suction_wrench` [m].
-    """
+    """Put all constant data of the renderer on the device. `table_height`: z of the table, on which the first bin stands [m]. `catalog`:
+    the objects; `Snapshot.catalog_index` is the index into it. Its props are the meshes behind them. `fixtures`: bins, then gripper shaft
+    and cup, each in its own frame. `cameras`: cameras of one image size; `Views.camera` is the index into it. `lights`: environment maps;
+    `Snapshot.light` is the index into it. `looks`: what episodes draw their looks from; None: nothing. `cup_radius`: radius of the suction
+    cup of the layers `suction_seal` and `suction_wrench` [m]."""
     # The first bin comes last, see `fixture_mesh`.
     bins, grip = fixtures[:-GRIPPER], fixtures[-GRIPPER:]
     fixtures = (*(prop.fixture for prop in catalog.props), *reversed(bins), *grip)

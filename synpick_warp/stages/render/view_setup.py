@@ -38,16 +38,10 @@ def pair_views(worlds: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def make_views(world: wp.array, camera: wp.array, count: int, instances: int, cameras: Any = None, slot: wp.array | None = None) -> Any:
-    """The struct `Views`, or `LensViews` if some cameras are distorted.
-
-    Args:
-        world: World of each view (view) int32; -1: the view is not in use.
-        camera: Camera of each view (view) int32.
-        count: Views in the batch; arrays may be longer.
-        instances: Instance capacity of a world.
-        cameras: The struct `CameraTable` or `LensCameras`; None: the renderer brings its own.
-        slot: Row of each view's camera in the scene (view) int32; None: that of its index.
-    """
+    """The struct `Views`, or `LensViews` if some cameras are distorted. `world`: world of each view (view) int32; -1: the view is not in
+    use. `camera`: camera of each view (view) int32. `count`: views in the batch; arrays may be longer. `cameras`: the struct `CameraTable`
+    or `LensCameras`; None: the renderer brings its own. `slot`: row of each view's camera in the scene (view) int32; None: that of its
+    index."""
     views = LensViews() if isinstance(cameras, LensCameras.cls) else Views()
     views.world, views.camera, views.count, views.instances = world, camera, count, instances
     views.slot = camera if slot is None else slot
@@ -102,16 +96,9 @@ def set_up_views(
     bodies: Any,
     placed: bool = False,
 ) -> None:
-    """Set each view's camera, transform the bodies into its axes, sort them front to back and bin them into tiles.
-
-    Args:
-        scene: Constant data.
-        snapshot: The worlds.
-        fixture_visible: Which fixtures are visible (world, fixture) int32.
-        views: The struct `Views`; its cameras are written.
-        bodies: The struct `ViewBodies`; written.
-        placed: Whether the views' cameras are set already. The static background is then of no use.
-    """
+    """Set each view's camera, transform the bodies into its axes, sort them front to back and bin them into tiles. `fixture_visible`: which
+    fixtures are visible (world, fixture) int32. `views`: the struct `Views`; its cameras are written. `bodies`: the struct `ViewBodies`;
+    written. `placed`: whether the views' cameras are set already. The static background is then of no use."""
     if not placed:
         wp.launch(kernel_for(aim_cameras_kernel, views), dim=views.count, inputs=[scene.cameras], outputs=[views], device=scene.device)
     dim = (views.count, bodies.mesh.shape[1])
