@@ -263,7 +263,8 @@ def gap(
 ) -> int:
     """Render the annotated objects of real images in front of these (twins), as a BOP data set: score a network on both.
 
-    A table compares brightness, contrast, saturation and detail of the objects in both. All but colour images is linked or copied.
+    A table compares statistics of the objects in both, and gives their likeness from 0 to 1. All but colour images is linked or copied.
+    After an interruption, the same command goes on.
     """
     from synpick_warp.cli.commands.evaluate import write_gap
 
