@@ -48,11 +48,12 @@ def upsample_step(records: wp.array3d[upsampling.RatioRecord], index: int, step:
     plane.facing = -1.0
     plane.height = -1.0
     plane.width = 1.0e-3
+    plane.normal = wp.vec3(0.0, 0.0, -1.0)
     for r in range(4):
         for c in range(4):
             ratio = wp.vec3(wp.where(c < 2, 1.0, 0.0))
             depth = wp.where(c < 2, 1.0, 1.0 + 4.0e-3 * step)
-            records[index, r, c] = upsampling.pack_ratios(ratio, ratio, ratio, depth, wp.uint8(1))
+            records[index, r, c] = upsampling.pack_ratios(ratio, ratio, ratio, coarse_grid.pack_surface(1, depth, plane.normal))
     ratios = upsampling.RatioImages()
     ratios.record = records
     return upsampling.upsample_ratios(ratios, coarse, index, 8, 8, plane).specular[0]

@@ -62,7 +62,7 @@ BORDER_VARIANCE = wp.constant(64.0 / 49.0)
 """Ratio of the variances of a mean over BLOCK² samples and over a block, whose border counts half but is shared with its neighbours."""
 MEDIUM_BLOCKS = wp.constant(4.0)
 """Blocks of the medium kernel: 2 x 2."""
-SAME_BODY_WEIGHT = wp.constant(0.02)
+SAME_BODY_WEIGHT = wp.constant(0.004)
 """Bilateral weight of a coarse pixel on the same body but on another surface: it reduces noise where few pixels are similar."""
 
 
@@ -332,8 +332,7 @@ def choose_widths_kernel(
         return
     index = flat_index(coarse.grid, view, row, column)
     surface = read_record(guide.surface, index)
-    segment = surface_segment(surface)
-    if int(segment) == Segment.NOTHING:
+    if int(surface_segment(surface)) == Segment.NOTHING:
         return
     plane = coarse_plane(coarse, surface, views.cameras, view, row, column)
     # The two middle rows come first: their inner blocks are the medium kernel. The loops are not unrolled, see `filter_blocks_kernel`.
@@ -359,7 +358,7 @@ def choose_widths_kernel(
     specular = visibility_ratio(narrow.specular, narrow.unoccluded_specular)
     if sums.weight <= 0.0:
         # The centres of all blocks lie on other bodies.
-        ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, narrow.indirect, surface_depth(surface), segment)
+        ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, narrow.indirect, surface)
         return
     scale = 1.0 / sums.weight
     pooled, variance = (variance_scale * scale) * sums.statistic, variance_scale * narrow.statistic
@@ -367,7 +366,7 @@ def choose_widths_kernel(
     diffuse = choose_ratio(wide, medium_diffuse, diffuse, medium_weight, pooled[0], medium_sum[0], variance[0])
     wide = visibility_ratio(sums.specular, sums.unoccluded_specular)
     specular = choose_ratio(wide, medium_specular, specular, medium_weight, pooled[1], medium_sum[1], variance[1])
-    ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, scale * sums.indirect, surface_depth(surface), segment)
+    ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, scale * sums.indirect, surface)
 
 
 @kernel_of_views
@@ -391,8 +390,7 @@ def smooth_ratios_kernel(
     history = flags.history_row[view]
     index = flat_index(coarse.grid, view, row, column)
     surface = read_record(guide.surface, index)
-    segment = surface_segment(surface)
-    if int(segment) == Segment.NOTHING:
+    if int(surface_segment(surface)) == Segment.NOTHING:
         ratios_out.record[history, row, column] = RatioRecord()
         return
     plane = coarse_plane(coarse, surface, views.cameras, view, row, column)
@@ -408,6 +406,4 @@ def smooth_ratios_kernel(
                     sums = add_ratios(sums, ratios.record[view, r, c], weight)
                     total += weight
     scale = 1.0 / total
-    ratios_out.record[history, row, column] = pack_ratios(
-        scale * sums.diffuse, scale * sums.specular, scale * sums.indirect, surface_depth(surface), segment
-    )
+    ratios_out.record[history, row, column] = pack_ratios(scale * sums.diffuse, scale * sums.specular, scale * sums.indirect, surface)
