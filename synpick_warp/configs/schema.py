@@ -221,6 +221,9 @@ class Render:
         8, "Maximum lamps of a map, small bright lights with shadow rays of their own; mode unoccluded: at most 1."
     )
     antialias: bool = setting(True, "Anti-alias the edges of surfaces; mode reference always does.")
+    shutter_samples: Annotated[int, "[2, 1024]"] = setting(
+        8, "Sub-frames, each as costly as a picture, that exposure_time and readout_time average; motion is that since the last frame."
+    )
     tone: str = setting(
         "shoulder",
         "Tone curve: shoulder (linear up to 0.6, highlights compressed), linear (clipped at 1) or filmic (ACES, middle grey kept).",

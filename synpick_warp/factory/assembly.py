@@ -330,7 +330,8 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     scene, rig, first = with_cameras(scene, own), config.rig, indices[0]
     chosen = replace(config, render=replace(config.render, layers=group_layers(config.rig, config.render, index)))
     colors = rig.writes(first, COLOR)
-    renderer = make_renderer(chosen, scene, objects, sizes["view"], history_count(rig, worlds, index), colors)
+    shutter = rig.shutter(first)
+    renderer = make_renderer(chosen, scene, objects, sizes["view"], history_count(rig, worlds, index), colors, shutter)
     lenses = tuple(camera.lens for camera in own) if rig.draws_lens(first) else ()
     pooled = sizes["mask_word"] < objects * most_words(*rig.sizes[first])
     bounds = MaskBounds.of(scene.meshes, own) if pooled else None
@@ -370,10 +371,18 @@ def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device
     return fitted
 
 
-def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0, colors: bool = True) -> Renderer:
+def make_renderer(
+    config: Config,
+    scene: RenderScene,
+    instances: int,
+    views: int,
+    histories: int = 0,
+    colors: bool = True,
+    shutter: tuple[float, float] = (0.0, 0.0),
+) -> Renderer:
     """Create the renderer of a bake from its sections of the settings, for `instances` instances a world and at most `views` views a batch.
 
-    `histories`, `colors`: see `Renderer`.
+    `histories`, `colors`: see `Renderer`. `shutter`: as of `Rig.shutter`.
     """
     return Renderer(
         scene,
@@ -386,4 +395,5 @@ def make_renderer(config: Config, scene: RenderScene, instances: int, views: int
         views=views,
         histories=histories,
         colors=colors,
+        shutter=(shutter[0] / config.physics.tick_time, shutter[1] / config.physics.tick_time),
     )

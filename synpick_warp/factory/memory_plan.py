@@ -115,7 +115,8 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
             glass = transparent or config.randomize.object_transmission.kind != OFF or None
             scene = blank_scene(count, *size, device, glass, len(config.prop))
             counts = {"instances": objects, "views": views["view"], "histories": history_count(rig, worlds, index)}
-            Renderer(scene, *sections, seed=0, depth_scale=1.0, colors=rig.writes(group[0], COLOR), **counts)
+            colors, shutter = rig.writes(group[0], COLOR), rig.shutter(group[0])
+            Renderer(scene, *sections, seed=0, depth_scale=1.0, colors=colors, shutter=shutter, **counts)
             if config.randomize != Randomize() or transparent:
                 allocate_materials(views["view"] * materials_of_view(objects + len(config.prop)), 1, device)
             allocate_placed(worlds, objects, len(config.prop), device)

@@ -33,10 +33,10 @@ def make_cameras(rig: Rig) -> tuple[Camera, ...]:
 
     With a field of view fx = fy = (W / 2) / tan(fov / 2), and the principal point is the middle of the image. Raises ConfigError: a
     camera's position is its look-at point, or its up vector is zero or parallel to its viewing direction."""
-    return tuple(_make_camera(rig.label(index), row) for index, row in enumerate(rig.rows))
+    return tuple(_make_camera(rig.label(index), row, rig.shutter(index)) for index, row in enumerate(rig.rows))
 
 
-def _make_camera(label: str, row: CameraRow) -> Camera:
+def _make_camera(label: str, row: CameraRow, shutter: tuple[float, float]) -> Camera:
     width, height = row.resolution or (0, 0)
     if row.matrix is None:
         focal = width / 2 / round(float(np.tan(np.radians(row.fov or 0.0) / 2)), DECIMALS)
@@ -44,7 +44,7 @@ def _make_camera(label: str, row: CameraRow) -> Camera:
     else:
         matrix = np.array(row.matrix, dtype=float)
     rotation, position = place(label, row.pose)
-    return Camera(width, height, matrix, rotation, -dot(rotation, position), row.name, lens_map(row), row.fixed_to or WORLD)
+    return Camera(width, height, matrix, rotation, -dot(rotation, position), row.name, lens_map(row), row.fixed_to or WORLD, shutter)
 
 
 def place(label: str, pose: Pose) -> tuple[np.ndarray, np.ndarray]:

@@ -262,6 +262,8 @@ class Camera:
     """Distortion of the lens; None: a pinhole."""
     fixed_to: str = WORLD
     """What carries the camera; rotation and translation lead from its frame, in place of the world's."""
+    shutter: tuple[float, float] = (0.0, 0.0)
+    """Exposure and readout time [s]."""
 
     @classmethod
     def at(cls, matrix: Sequence[Sequence[float]] | np.ndarray, resolution: tuple[int, int], pose: Any) -> "Camera":
@@ -284,3 +286,8 @@ class Camera:
     def distortion(self) -> dict[str, Any]:
         """Model and OpenCV's coefficients of the lens, as keys of BOP's files; none of a pinhole."""
         return {} if self.lens is None else {"cam_dist_model": self.lens.lens.model, "cam_dist": list(self.lens.lens.coefficients)}
+
+    @property
+    def sensor(self) -> dict[str, Any]:
+        """`distortion`, and exposure and readout time if it has either, as keys of BOP's files."""
+        return self.distortion | (dict(zip(("exposure_time", "readout_time"), self.shutter, strict=True)) if any(self.shutter) else {})

@@ -193,6 +193,12 @@ NOT_FIXED = "in {path}; allowed: the name of a camera that is fixed to the world
         (LEFT + 'modalities = ["flow"]\n', "allowed: names of layers that are in render.layers, as flow is not"),
         (LEFT + 'modalities = ["depth"]\n[bake]\nformats = ["bop", "coco"]\n', "allowed: color among them with the format coco"),
         (LEFT + 'modalities = ["color"]\n[bake]\nformats = ["points"]\n', "allowed: depth among them with the format points"),
+        (LEFT + "readout_time = -0.1\n", "camera[0].readout_time is -0.1 in {path}; allowed: at least 0, at most 10 [s]"),
+        (
+            LEFT + "exposure_time = 0.04\nreadout_time = 0.03\n",
+            "camera[0].exposure_time is 0.04 in {path}; allowed: with readout_time at most 0.066",
+        ),
+        (LEFT + "readout_time = 0.07\n", "allowed: with exposure_time at most 0.066, the time from one frame to the next [s]"),
         (LEFT + "every = 0\n", "camera[0].every is 0 in {path}; allowed: at least 1, at most 1000 [frames]"),
         (LEFT + 'every = 2\n[bake]\nformats = ["lerobot"]\n', "camera[0].every is 2 in {path}; allowed: 1 with the format lerobot"),
         (LEFT + 'every = 2\n[render]\nlayers = ["flow"]\n', "allowed: 1 with the layer flow, which leads to the frame before"),

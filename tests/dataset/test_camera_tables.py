@@ -100,16 +100,24 @@ def test_zarr_and_lerobot_have_cameras_of_their_sizes(cell):
             assert {(frame.width, frame.height) for frame in container.decode(video=0)} == {(width, height)}
 
 
-BENT = make_camera("bent", **SIDE, matrix=MATRICES[0].tolist(), distortion=[-0.3, 0.08, 0.0005, -0.0003]), make_camera("flat", fov=40.0)
+BENT = (
+    make_camera("bent", **SIDE, matrix=MATRICES[0].tolist(), distortion=[-0.3, 0.08, 0.0005, -0.0003]),
+    make_camera("flat", fov=40.0, exposure_time=0.01),
+)
 
 
 @pytest.mark.parametrize("rectified", [False, True])
 def test_a_rectified_set_is_that_of_a_pinhole_with_the_same_matrix(tmp_path, rectified):
-    bake_cell(tmp_path / "set", cell_config(BENT, **{"bop.rectified": rectified, "bake.formats": ["bop", "shards", "points"]}))
+    bake_cell(
+        tmp_path / "set",
+        cell_config(BENT, **{"bop.rectified": rectified, "bake.formats": ["bop", "shards", "points"], "render.shutter_samples": 2}),
+    )
     bent, flat = (json.loads((tmp_path / f"set/train/{scene:06d}/scene_camera.json").read_text())["0"] for scene in (0, 1))
     assert bent["cam_K"] == np.ravel(MATRICES[0]).tolist()
     assert (bent.get("cam_dist"), flat.get("cam_dist")) == (None if rectified else [-0.3, 0.08, 0.0005, -0.0003], None)
     assert ("cam_dist" in (tmp_path / "set/camera_bent.json").read_text()) is not rectified
+    assert ("exposure_time" in bent, flat["exposure_time"], flat["readout_time"]) == (False, 0.01, 0.0)
+    assert json.loads((tmp_path / "set/camera_flat.json").read_text())["exposure_time"] == 0.01
     assert all(line.holds for line in vars(check(tmp_path / "set", 4)).values())
     for card in ("dataset_info.md", "README.md"):
         lines = (tmp_path / "set" / card).read_text().splitlines()

@@ -48,6 +48,11 @@ class Cameras:
     ups: Annotated[tuple[tuple[float, float, float], ...], "[-1e3, 1e3]"] = setting(
         ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)), "Up vector of each camera."
     )
+    exposure_time: Annotated[float, "[0, 10] s"] = setting(
+        0.0,
+        "Exposure of each row of colour images: motion blur. All other images, poses and boxes are of the middle row's mid-exposure.",
+    )
+    readout_time: Annotated[float, "[0, 10] s"] = setting(0.0, "Delay from the first row's exposure to the last one's: rolling shutter.")
 
 
 @dataclass(frozen=True)
@@ -124,6 +129,8 @@ class CameraRow:
     modalities: tuple[str, ...] | None = setting(
         None, "Images in its files, of layers those in render.layers; not given: all.", choices=MODALITIES
     )
+    exposure_time: Annotated[float, "[0, 10] s"] = setting(0.0, "As cameras.exposure_time.")
+    readout_time: Annotated[float, "[0, 10] s"] = setting(0.0, "As cameras.readout_time.")
     every: Annotated[int | None, "[1, 1000] frames"] = setting(None, "Frames from one picture to the next, from frame 0; not given: 1.")
     jitter: Jitter | None = setting(
         None, "What each episode draws of the camera anew: {position, rotation, focal_length, center}, each a distribution."
@@ -293,7 +300,8 @@ class Rig:
                 counts = f"{len(cameras.positions)} entries and cameras.ups {len(cameras.ups)}"
                 raise ConfigError(f"cameras.positions has {counts}; each camera needs one of both")
             pairs = zip(cameras.positions, cameras.ups, strict=True)
-            rows = tuple(CameraRow(fov=cameras.fov, pose=Pose(position=at, look_at=cameras.target, up=up)) for at, up in pairs)
+            row = CameraRow(fov=cameras.fov, exposure_time=cameras.exposure_time, readout_time=cameras.readout_time)
+            rows = tuple(replace(row, pose=Pose(position=at, look_at=cameras.target, up=up)) for at, up in pairs)
         if still and still.views:
             poses = (still.pose((1.0, 0.5, index / still.views, 0.5, 0.5, 0.5, 0.5)) for index in range(still.views))
             rows = tuple(replace(rows[0], name="", pose=pose) for pose in poses)
@@ -322,11 +330,11 @@ class Rig:
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the cameras that are rendered together: of one image size and `every`, all placed or none, all moving or none, all
-        with lenses that are drawn or none, and all with the same colour and layers."""
+        """Indices of the cameras that are rendered together: of one image size, `every` and shutter, all placed or none, all moving or
+        none, all with lenses that are drawn or none, and all with the same colour and layers."""
         states = [(self.is_placed(index), self.moves(index), self.draws_lens(index)) for index in range(len(self))]
         made = [self.chosen(index, (COLOR, *LAYER_TABLE)) for index in range(len(self))]
-        kinds = list(zip(self.sizes, self.every, states, made, strict=True))
+        kinds = list(zip(self.sizes, self.every, states, made, map(self.shutter, range(len(self))), strict=True))
         return tuple(tuple(index for index, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds))
 
     @cached_property
@@ -351,6 +359,10 @@ class Rig:
     def is_placed(self, index: int) -> bool:
         """Whether a camera's matrix and pose are not the same in all views."""
         return bool(self.dome) or self.rows[index].jitter is not None or self.moves(index)
+
+    def shutter(self, index: int) -> tuple[float, float]:
+        """Exposure and readout time of a camera [s]; 0, 0: its pictures are of an instant, or those of piles at rest."""
+        return (0.0, 0.0) if self.still else (self.rows[index].exposure_time, self.rows[index].readout_time)
 
     def draws_lens(self, index: int) -> bool:
         """Whether a camera has lens distortion and intrinsics that are randomized per episode, so that the rays of its pixels change."""

@@ -151,6 +151,9 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
         yield from _matrix(rig.key(index, "matrix"), row.matrix, width, height)
     if row.distortion:
         yield from _lens(rig.key(index, "distortion"), row, config.render.layers)
+    if sum(times := rig.shutter(index)) > config.physics.tick_time:
+        name, other = ("exposure_time", "readout_time")[:: -1 if times[1] > times[0] else 1]
+        yield rig.key(index, name), f"with {other} at most {config.physics.tick_time:g}, the time from one frame to the next [s]"
     keys = [rig.key(index, "pose", name) for name in ("positions", "ups", "target")]
     placement = partial(_placement, label=label, bins=bins, shift=config.bins.shift)
     if rig.moves(index):

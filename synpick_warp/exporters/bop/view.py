@@ -292,7 +292,7 @@ def write_stored_views(
 
 def make_camera_constants(camera: Camera, depth_scale: float) -> dict[str, Any]:
     """Constant part of a camera's entries in scene_camera.json."""
-    return _pose_keys(camera.matrix, camera.rotation, camera.translation) | {"depth_scale": depth_scale, **camera.distortion}
+    return _pose_keys(camera.matrix, camera.rotation, camera.translation) | {"depth_scale": depth_scale, **camera.sensor}
 
 
 def _pose_keys(matrix: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> dict[str, Any]:

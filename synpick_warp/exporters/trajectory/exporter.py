@@ -135,8 +135,9 @@ def write_constants(context: ExportContext) -> None:
     entries, cameras = context.catalog.entries, context.cameras
     columns = {name: [entry.obj_id if name == "object_id" else getattr(entry, name) for entry in entries] for name in OBJECTS.arrays}
     add_table(root, "objects", OBJECTS, columns, level, {"names": [entry.name for entry in entries]})
-    known = {"fixed_to": [camera.fixed_to for camera in cameras], "distortion": [camera.distortion or None for camera in cameras]}
-    usual = {"fixed_to": WORLD, "distortion": None}
+    known: dict[str, list[Any]] = {"fixed_to": [camera.fixed_to for camera in cameras], "shutter": [camera.shutter for camera in cameras]}
+    known["distortion"] = [camera.distortion or None for camera in cameras]
+    usual = {"fixed_to": WORLD, "distortion": None, "shutter": (0.0, 0.0)}
     unusual = {name: values for name, values in known.items() if any(value != usual[name] for value in values)}
     columns = {name: [getattr(camera, name) for camera in cameras] for name in CAMERAS.arrays}
     add_table(root, "cameras", CAMERAS, columns, level, unusual)

@@ -24,11 +24,11 @@ def camera_files(layout: DataLayout) -> tuple[str, ...]:
 
 
 def write_cameras(out: Path, layout: DataLayout, cameras: tuple[Camera, ...], depth_scale: float) -> None:
-    """Write camera.json (the first camera) and `camera_files`: size, intrinsics [px], mm per depth unit, and lens distortion if any."""
+    """Write camera.json (the first camera) and `camera_files`: size, intrinsics [px], mm per depth unit; distortion and shutter if any."""
     for name, camera in ((CAMERA_FILE, cameras[0]), *zip(camera_files(layout), cameras, strict=False)):
         (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
         content = {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale}
-        (out / name).write_text(json.dumps(content | camera.distortion, indent=2) + "\n", encoding="ascii")
+        (out / name).write_text(json.dumps(content | camera.sensor, indent=2) + "\n", encoding="ascii")
 
 
 def describe_sizes(layout: DataLayout, cameras: tuple[Camera, ...]) -> str:

@@ -17,6 +17,7 @@ from synpick_warp.stages.render.props import PropPlacer
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
+from synpick_warp.stages.render.shutter import Shutter
 from synpick_warp.stages.render.transparency import SceneBehind, allocate_image
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_shot, set_up_views, with_cameras
 from synpick_warp.stages.timing import scope
@@ -51,11 +52,17 @@ class Renderer:
         views: int,
         histories: int = 0,
         colors: bool = True,
+        shutter: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """Allocate scratch. `seed`: seed of all random numbers. `depth_scale`: millimetres per count of the depth image. `instances`:
         instance capacity of a world, at most `MAX_INSTANCES`. `histories`: worlds times cameras whose light is averaged over the frames of
         an episode; 0: each frame is rendered by itself. `colors`: whether colour images are wanted; else they stay as they are, and nothing
-        is shaded."""
+        is shaded. `shutter`: exposure and readout time of colour images [frames]; 0, 0: an instant."""
+        self.shutter: Shutter | None = None
+        if colors and any(shutter):
+            still = replace(settings, layers=())
+            given = {"seed": seed, "depth_scale": depth_scale, "instances": instances, "views": views}
+            self.shutter = Shutter(Renderer(scene, still, Effects(), depth_sensor, **given), *shutter, settings.shutter_samples)
         self.props = PropPlacer(scene, instances)
         bodies = self.props.bodies
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(bodies, scene.width, scene.height)
@@ -70,7 +77,7 @@ class Renderer:
         kept = 0
         if colors:
             self.image = allocate_image(sizes, scene.device)
-            if has_effects(effects) or scene.is_transparent:
+            if has_effects(effects) or scene.is_transparent or self.shutter:
                 settings = replace(settings, reuse=False)
             kept_row = None
             if settings.mode == schema.REFERENCE:
@@ -100,27 +107,49 @@ class Renderer:
             raise ValueError(f"{views.count} views in a batch; this renderer has scratch for {self.views}")
         if views.count == 0:
             return
-        device = self.scene.device
+        device, state = self.scene.device, snapshot
         snapshot, views = self.render_gbuffer(snapshot, views, out, placed)
-        shot = make_shot(self.scene, snapshot.frames, self.bodies, self.gbuffer, self.props.widen(views))
-        behind = self.behind.rasterize(snapshot, shot) if self.behind else None
+        shot, behind = self._make_shot(snapshot, views)
+        last = views.cameras if placed is None else placed[1]
         if layers is not None:
             with scope("layers", device):
-                self.layer_renderer.render(snapshot, shot, layers, views.cameras if placed is None else placed[1], behind)
+                self.layer_renderer.render(snapshot, shot, layers, last, behind)
         if self.shading is not None:
             with scope("shade", device):
-                if self.behind is None:
-                    self.shading.shade(snapshot, shot, self.image)
-                else:
-                    self.shading.shade(snapshot, self.behind.render(snapshot, shot), self.image, self.behind.add)
+                self._shade(snapshot, shot)
+            if self.shutter is not None:
+                with scope("expose", device):
+                    self.shutter.expose(state, views, last, self.image)
             with scope("post-process", device):
                 self.postprocessor.process(shot, self.image, out)
         shot.views = views
         with scope("annotate", device):
             self.annotator.annotate(shot, self.damage, out)
 
-    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: tuple[Any, Any] | None = None) -> Any:
-        """First part of `render`: G-buffer, depth, instances, amodal masks. Returns the snapshot with props, and the views with cameras."""
+    def render_radiance(self, snapshot: Snapshot, views: Any, seed: int) -> Any:
+        """The struct `ShadedImage` of a batch of views whose cameras are set, with paths by another seed; arguments as of `render`."""
+        for part in (self.shading, self.behind and self.behind.shading):
+            if part is not None:
+                part.rules.seed = seed
+        snapshot, views = self.render_gbuffer(snapshot, views, None, (views.cameras, views.cameras))
+        self._shade(snapshot, self._make_shot(snapshot, views)[0])
+        return self.image
+
+    def _make_shot(self, snapshot: Snapshot, views: Any) -> tuple[Any, Any]:
+        """The struct `ShotData` of views whose G-buffer is rendered, and that of the scene behind them, as of `SceneBehind.rasterize`."""
+        shot = make_shot(self.scene, snapshot.frames, self.bodies, self.gbuffer, self.props.widen(views))
+        return shot, self.behind.rasterize(snapshot, shot) if self.behind else None
+
+    def _shade(self, snapshot: Snapshot, shot: Any) -> None:
+        """Shade `image`; arguments as of `DenoisedRenderer.shade`."""
+        if self.behind is None:
+            self.shading.shade(snapshot, shot, self.image)
+        else:
+            self.shading.shade(snapshot, self.behind.render(snapshot, shot), self.image, self.behind.add)
+
+    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers | None, placed: tuple[Any, Any] | None = None) -> Any:
+        """First part of `render`: G-buffer and, with `out`, depth, instances, amodal masks. Returns the snapshot with props, and the views
+        with cameras."""
         scene, views = self.scene, with_cameras(views, self.cameras if placed is None else placed[0])
         snapshot, wide = self.props.place(snapshot, snapshot.fixture_visible), self.props.widen(views)
         with scope("set up views", scene.device):
@@ -134,5 +163,6 @@ class Renderer:
             self.damage = self.shading.find_damage(snapshot, self.bodies, wide) or self.damage
         with scope("rasterize", scene.device):
             self.rasterizer.rasterize(self.bodies, wide, self.gbuffer, out, self.damage)
-            self.props.hide(out.instance, views.count)
+            if out is not None:
+                self.props.hide(out.instance, views.count)
         return snapshot, views

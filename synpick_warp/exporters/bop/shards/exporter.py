@@ -117,6 +117,8 @@ def _features(settings: ExportSettings) -> dict[str, object]:
     camera = {"cam_K": _NUMBERS, "cam_R_w2c": _NUMBERS, "cam_t_w2c": _NUMBERS, "depth_scale": "float64", "light": _LIGHT}
     if any(lens_map(row) is not None for row in settings.rig.rows):
         camera |= {"cam_dist_model": "string", "cam_dist": _NUMBERS}
+    if any(any(settings.rig.shutter(index)) for index in range(len(settings.rig))):
+        camera |= {"exposure_time": "float64", "readout_time": "float64"}
     if settings.effects:
         camera["effects"] = dict.fromkeys(settings.effects, "float64")
     masks = {str(index): _MASK for index in range(settings.objects)}
