@@ -50,11 +50,9 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     `bake.models` is a BOP model folder (obj_NNNNNN.ply in millimetres, models_info.json), a folder of meshes in metres, which get obj_ids
     from 1 in the order of their file names, or a folder of such folders. If it is empty: the embedded objects. Objects that cannot be used
     are left out, with a line each; with `objects.strict`, the first of them is an error. Files are read in isolated processes; one for
-    which time or memory of this machine does not suffice is an error, as elsewhere the same settings would give another catalog.
-
-    Args:
-        config: Settings: bake.models, objects, object_rows, bins, arrangement.volume, distractors of randomize.
-        cache_dir: Folder in which collision shapes are cached; None: `default_cache_dir()`.
+    which time or memory of this machine does not suffice is an error, as elsewhere the same settings would give another catalog. `config`:
+    settings: bake.models, objects, object_rows, bins, arrangement.volume, distractors of randomize. `cache_dir`: folder in which collision
+    shapes are cached; None: `default_cache_dir()`.
 
     Raises CatalogError: the folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has
     an invalid mass. Or time or memory does not suffice for a file."""

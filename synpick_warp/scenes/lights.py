@@ -58,13 +58,10 @@ _RGBE, _XYZE = b"32-bit_rle_rgbe", b"32-bit_rle_xyze"
 def load_lights(folder: str, report: Callable[[str], None] = ignore, strict: bool = False) -> tuple[EnvironmentMap, ...]:
     """Load all environment maps of a folder and its direct subfolders, sorted by name.
 
-    A folder with an .ibl file is an sIBL set (hdrlabs.com/sibl), of which the reflection map and the sun are used. In other folders
-    every .hdr file is a map. The image's middle column becomes azimuth 0 (+x); columns right of it, as seen from inside, get negative
-    azimuth. Maps are read in isolated processes; those that cannot be used are left out with a line each.
-
-    Args:
-        folder: The folder; empty: the embedded maps.
-        strict: Whether the first map that cannot be used is an error.
+    A folder with an .ibl file is an sIBL set (hdrlabs.com/sibl), of which the reflection map and the sun are used. In other folders every
+    .hdr file is a map. The image's middle column becomes azimuth 0 (+x); columns right of it, as seen from inside, get negative azimuth.
+    Maps are read in isolated processes; those that cannot be used are left out with a line each. `folder`: the folder; empty: the embedded
+    maps. `strict`: whether the first map that cannot be used is an error.
 
     Raises LightError: the folder does not exist or contains no map that can be used, two have the same name, or time or memory of this
     machine does not suffice for one."""

@@ -49,14 +49,11 @@ def load_config(
 ) -> Config:
     """Load a preset or a TOML file, override single settings, and validate the result; see `synpick_warp.load_config`.
 
-    Settings override the file, the file its preset (or "synpick"), the preset the defaults of the schema. Values may be lists
-    for TOML's arrays, tuples or arrays. Paths are relative to the current folder; those in a file to that file.
-
-    Args:
-        source: Where `settings` come from, for error messages.
-        splits: Whether the splits of a preset hold, such as train and test of "synpick", unless a file sets mode or episodes otherwise;
-            the [splits] of a file always hold.
-        measure: Tables and sections to replace, of bins and gripper, with what their meshes measure; None: without.
+    Settings override the file, the file its preset (or "synpick"), the preset the defaults of the schema. Values may be lists for TOML's
+    arrays, tuples or arrays. Paths are relative to the current folder; those in a file to that file. `source`: where `settings` come from,
+    for error messages. `splits`: whether the splits of a preset hold, such as train and test of "synpick", unless a file sets mode or
+    episodes otherwise; the [splits] of a file always hold. `measure`: tables and sections to replace, of bins and gripper, with what their
+    meshes measure; None: without.
 
     Raises ConfigError: There is no such preset or file, the file is not valid TOML, a key is unknown, a value is not allowed, or values
     contradict each other. The message names key, value and source, and what is allowed."""

@@ -226,13 +226,8 @@ def bake_vertex_colors(
 
     Without a texture N is 2: with corner colours a, b, c, three texels hold these and the fourth b + c - a, clipped to 0 .. 1. Where
     nothing is clipped, bilinear filtering equals barycentric interpolation over the triangle up to 8-bit rounding. It never reads another
-    triangle's texels.
-
-    Args:
-        faces: Vertex indices (F, 3).
-        colors: Vertex colours, sRGB in 0..1 (V, 3).
-        factor: Linear factor (3); None: 1.
-        skin: Texture coordinates (V, 2), and the texture (H, W, 3) uint8, which repeats; its colours are multiplied in linear light.
+    triangle's texels. `faces`: vertex indices (F, 3). `colors`: vertex colours, sRGB in 0..1 (V, 3). `factor`: linear factor (3); None: 1.
+    `skin`: texture coordinates (V, 2), and the texture (H, W, 3) uint8, which repeats; its colours are multiplied in linear light.
 
     Returns the texture coordinates of the 3 F corners (3 F, 2) float32, and the texture (S, S, 3) uint8."""
     texels = 2 if skin is None else _texels_per_triangle(faces, *skin)

@@ -167,10 +167,8 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
 
 
 def queue_sizes(render: Render, width: int, height: int, views: int, histories: int, device: wp.Device) -> dict[str, int]:
-    """Extents of the dimensions of `PATH_QUEUES`, for at most `views` views of a batch.
-
-    There are no queues on a CPU, which has no warps, nor where no paths are traced, or several in every coarse pixel.
-    """
+    """Extents of the dimensions of `PATH_QUEUES`, for at most `views` views of a batch. There are no queues on a CPU, which has no warps,
+    nor where no paths are traced, or several in every coarse pixel."""
     single = accumulates(render, histories) or paths_per_coarse_pixel(render, width, histories) == 1
     size = coarse_size(render, width, histories)
     regions = interleaved_threads(-(-width // size), -(-height // size)) // int(REGION_PIXELS)
@@ -309,10 +307,8 @@ class DenoisedRenderer:
         return bundle(Damage, self.flags, self.moving)
 
     def trace_coarse_paths(self, shot: Any) -> None:
-        """Coarse path pass: guide image and light of coarse pixels, traced or taken from the history (temporal accumulation).
-
-        Wavefront path tracing where there are queues: one launch for the first bounce, then one for each further bounce.
-        """
+        """Coarse path pass: guide image and light of coarse pixels, traced or taken from the history (temporal accumulation). Wavefront
+        path tracing where there are queues: one launch for the first bounce, then one for each further bounce."""
         scene, views, threads = self.scene, shot.views, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
         if self.history.max_paths > 0:
             self.path_lists.count.zero_()

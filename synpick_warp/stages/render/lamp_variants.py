@@ -68,10 +68,8 @@ def lamp_direction(azimuth: float, elevation: float) -> np.ndarray:
 
 
 def black_body_color(temperature: float) -> np.ndarray:
-    """Linear sRGB (3) of a black body of a temperature [K], 1,700 to 25,000, of luminance 1; components are at least 0.
-
-    Cubic approximation of the Planckian locus (Kim et al., 2002).
-    """
+    """Linear sRGB (3) of a black body of a temperature [K], 1,700 to 25,000, of luminance 1; components are at least 0. Cubic approximation
+    of the Planckian locus (Kim et al., 2002)."""
     inverse = 1000.0 / temperature
     x = np.polyval(next(row for end, row in _LOCUS_X if temperature <= end), inverse)
     y = np.polyval(next(row for end, row in _LOCUS_Y if temperature <= end), x)

@@ -164,10 +164,8 @@ def build_environment_cdf(radiance: np.ndarray, device: wp.Device, table: bool =
 
 
 def guide_table(cdf: np.ndarray) -> np.ndarray:
-    """Guide tables (Chen and Asau, 1974) of CDFs (..., n + 1): their inverses at u = 0, 1 / N, ... 1, (..., N + 1) uint16.
-
-    N is the smallest power of two that is at least n, so that kernels compute the cell of a float32 without rounding.
-    """
+    """Guide tables (Chen and Asau, 1974) of CDFs (..., n + 1): their inverses at u = 0, 1 / N, ... 1, (..., N + 1) uint16. N is the
+    smallest power of two that is at least n, so that kernels compute the cell of a float32 without rounding."""
     entries = cdf.shape[-1] - 1
     cells = 1 << (entries - 1).bit_length()
     thresholds = np.arange(cells + 1) / cells

@@ -35,10 +35,8 @@ class ReferenceRenderer:
         self.rules = make_path_rules(render, seed, render.samples, ROULETTE)
 
     def shade(self, snapshot: Snapshot, shot: Any, image: Any, add: Callable[[Any, Any], None] | None = None) -> None:
-        """Render the radiance of a batch of views; arguments as of `DenoisedRenderer.shade`.
-
-        It is anti-aliased. Each path traces its own camera ray: the G-buffer is read for the floor alone.
-        """
+        """Render the radiance of a batch of views; arguments as of `DenoisedRenderer.shade`. It is anti-aliased. Each path traces its own
+        camera ray: the G-buffer is read for the floor alone."""
         scene, pixels = self.scene, shot.views.count * self.scene.grid.tiles * int(TILE_PIXELS)
         launch_pixels(trace_paths_kernel, pixels, [scene.paths, shot, self.rules], [image], scene.device)
         shade_floor(scene, shot, image)

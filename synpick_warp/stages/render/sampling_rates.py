@@ -36,10 +36,8 @@ def shadow_size(size: int) -> int:
 
 
 def edge_rays(size: int) -> int:
-    """Shadow rays to a lamp from each pixel at a steep edge of its shadow, where coarse pixels are `size` px wide.
-
-    Four are filtered over 3 x 3 instead of 5 x 5 pixels, which in narrow images would blur shadows.
-    """
+    """Shadow rays to a lamp from each pixel at a steep edge of its shadow, where coarse pixels are `size` px wide. Four are filtered over 3
+    x 3 instead of 5 x 5 pixels, which in narrow images would blur shadows."""
     return 4 if size <= 2 else 1
 
 
@@ -81,10 +79,8 @@ def first_frame_paths(render: Render, width: int, histories: int = 0) -> int:
 
 
 def supersamples(render: Render, width: int, histories: int = 0) -> bool:
-    """Whether shading is supersampled: only where coarse pixels are pixels.
-
-    A pixel then covers much detail of textures and normals. Four samples gain 0.2 to 0.5 dB in PSNR.
-    """
+    """Whether shading is supersampled: only where coarse pixels are pixels. A pixel then covers much detail of textures and normals. Four
+    samples gain 0.2 to 0.5 dB in PSNR."""
     return traces_paths(render) and coarse_size(render, width, histories) == 1
 
 

@@ -76,16 +76,11 @@ def start_process(
     *,
     has_threads: bool = False,
 ) -> WorkerProcess:
-    """Start a process. Its standard output is the null device, since the inherited one may be full or closed.
-
-    Args:
-        program: Python code that imports and calls the main function. It is imported, not run as `__main__`, so that pickled messages
-            name the module's own classes.
-        handles: File handles that it uses; sys.argv[1] is the number of its link's handle, the next arguments are the
-            numbers of these.
-        inherited: File handles that it keeps open until it exits, such as one that holds a lock.
-        environment: Environment variables that it has besides those of this process.
-        has_threads: Whether its libraries start as many threads as those of this process.
+    """Start a process. Its standard output is the null device, since the inherited one may be full or closed. `program`: python code that
+    imports and calls the main function. It is imported, not run as `__main__`, so that pickled messages name the module's own classes.
+    `handles`: file handles that it uses; sys.argv[1] is the number of its link's handle, the next arguments are the numbers of these.
+    `inherited`: file handles that it keeps open until it exits, such as one that holds a lock. `environment`: environment variables that it
+    has besides those of this process. `has_threads`: whether its libraries start as many threads as those of this process.
 
     Raises OSError: processes, memory or descriptors are used up."""
     ours, theirs = socket.socketpair()

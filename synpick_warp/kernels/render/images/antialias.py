@@ -305,10 +305,8 @@ def find_ranks(bodies: ViewBodies, view: int, tile: int, segments: wp.vec4i, ins
 
 @wp.func
 def trace_visible(meshes: Meshes, shot: AnyShot, view: int, row: int, column: int, tile: int, ray: wp.vec3) -> Hit:
-    """Closest hit of a coverage ray among the bodies that its footprint's corners show, at most four.
-
-    All are found before the first is traced, so that rays of a warp traverse BVHs at the same time.
-    """
+    """Closest hit of a coverage ray among the bodies that its footprint's corners show, at most four. All are found before the first is
+    traced, so that rays of a warp traverse BVHs at the same time."""
     instances = shot.views.instances
     ranks, found = find_ranks(shot.bodies, view, tile, visible_segments(shot, view, row, column), instances)
     hit = no_hit()
@@ -324,13 +322,8 @@ def select_source(
 ) -> int:
     """Corner of a footprint that matches a coverage ray's hit best: same body, least sum of plane distance, normal difference and distance.
 
-    Normals of background and table are not compared.
-
-    Args:
-        own: Corner whose pixel owns the sample; the result if no corner shows the body.
-        offset: The sample [px from that pixel's centre].
-        plane: Tangent plane of the hit, as seen from that pixel.
-    """
+    Normals of background and table are not compared. `own`: corner whose pixel owns the sample; the result if no corner shows the body.
+    `offset`: the sample [px from that pixel's centre]. `plane`: tangent plane of the hit, as seen from that pixel."""
     mesh = int(-1)
     if hit.segment != Segment.NOTHING and hit.segment != Segment.TABLE:
         mesh = shot.bodies.mesh[view, body_of(hit.segment, shot.views.instances)]

@@ -167,10 +167,7 @@ def list_border_boxes_kernel(
     border_inout: BorderCounts,
 ):
     """List the instances that moved and whose boxes reach beyond the image, in any order, with `chunk` pixels to a chunk, and clear their
-    counts there. `length` starts at 0.
-
-    Launched over view, instance.
-    """
+    counts there. `length` starts at 0. Launched over view, instance."""
     view, instance = wp.tid()
     if not has_moved(damage, view, instance):
         return
@@ -244,10 +241,8 @@ def count_border_pixels_kernel(
 
 @wp.kernel
 def finish_boxes_counts_kernel(damage: Damage, border: BorderCounts, counts_inout: BoxesCounts):
-    """Add what lies beyond the image to the amodal counts and boxes, and set boxes without pixels to (0, 0, -1, -1).
-
-    Launched over view, instance, box.
-    """
+    """Add what lies beyond the image to the amodal counts and boxes, and set boxes without pixels to (0, 0, -1, -1). Launched over view,
+    instance, box."""
     view, instance, box = wp.tid()
     if box == AMODAL_BOX:
         row = damage.kept_row[view]

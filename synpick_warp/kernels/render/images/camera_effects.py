@@ -96,10 +96,8 @@ def sample_effects_kernel(
     # Out:
     effects_out: wp.array[EffectParameters],  # (view)
 ):
-    """Sample the effect parameters of each view: low_i + (high_i - low_i) u_i, with u_i uniform in [0, 1).
-
-    u_i are of the random number stream (seed, episode, frame, camera, EFFECTS). JPEG quality is a uniform integer. Launched over view.
-    """
+    """Sample the effect parameters of each view: low_i + (high_i - low_i) u_i, with u_i uniform in [0, 1). u_i are of the random number
+    stream (seed, episode, frame, camera, EFFECTS). JPEG quality is a uniform integer. Launched over view."""
     view = wp.tid()
     key = shot_key(ranges.seed, shot, view, Stream.EFFECTS)
     parameters = EffectParameters()
@@ -173,10 +171,8 @@ def color_gains(parameters: EffectParameters) -> wp.vec3:
 
 @wp.func
 def channel_magnification(channel: int, aberration: float, corner: float) -> float:
-    """Lateral chromatic aberration as a magnification: red 1 + aberration / corner, green 1, blue 1 - aberration / corner.
-
-    `corner` is the distance of the farthest corner from the principal point [px], `aberration` the displacement there [px].
-    """
+    """Lateral chromatic aberration as a magnification: red 1 + aberration / corner, green 1, blue 1 - aberration / corner. `corner` is the
+    distance of the farthest corner from the principal point [px], `aberration` the displacement there [px]."""
     return 1.0 + float(1 - channel) * aberration / corner
 
 

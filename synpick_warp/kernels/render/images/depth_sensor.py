@@ -26,10 +26,8 @@ def disparity_at(gbuffer: GBuffer, focal_baseline: float, view: int, row: int, c
 
 @wp.func
 def near_discontinuity(shot: AnyShot, sensor: SensorParameters, focal_baseline: float, view: int, row: int, column: int) -> bool:
-    """Edge invalidation: True if disparities within the matching window differ by more than the threshold from the centre's.
-
-    A window over two surfaces has no match, or that of the wrong surface.
-    """
+    """Edge invalidation: True if disparities within the matching window differ by more than the threshold from the centre's. A window over
+    two surfaces has no match, or that of the wrong surface."""
     here = disparity_at(shot.gbuffer, focal_baseline, view, row, column)
     for down in range(-sensor.edge_width, sensor.edge_width + 1):
         for right in range(-sensor.edge_width, sensor.edge_width + 1):
@@ -136,10 +134,8 @@ def axial_noise(sensor: SensorParameters, depth: float, cosine: float) -> float:
 
 @wp.func
 def quantize_depth(sensor: SensorParameters, focal_baseline: float, depth: float, noise: float) -> float:
-    """Depth whose disparity, with `noise` standard deviations added, is rounded to the nearest multiple of the step [m].
-
-    0: outside of the measuring range.
-    """
+    """Depth whose disparity, with `noise` standard deviations added, is rounded to the nearest multiple of the step [m]. 0: outside of the
+    measuring range."""
     if depth < sensor.near or depth > sensor.far:
         return 0.0
     if sensor.max_disparity > 0.0 and focal_baseline > sensor.max_disparity * depth:

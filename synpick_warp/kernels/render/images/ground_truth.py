@@ -76,10 +76,8 @@ def gather_objects_kernel(
     # Out:
     truth_out: ViewTruth,
 ):
-    """Gather obj_id and pose of each instance: object to world as simulated, object to camera computed in float64.
-
-    Instances that are not in the scene get obj_id -1 and the identity. Launched over view, instance.
-    """
+    """Gather obj_id and pose of each instance: object to world as simulated, object to camera computed in float64. Instances that are not
+    in the scene get obj_id -1 and the identity. Launched over view, instance."""
     view, instance = wp.tid()
     world = views.world[view]
     entry = snapshot.catalog_index[world, instance]
@@ -105,10 +103,8 @@ def expand_masks_kernel(
     # Out:
     mask_out: wp.array4d[wp.bool],  # (view, instance, row, column)
 ):
-    """Make one binary mask per instance: visible masks from the id image or, if `is_amodal`, amodal masks from their boxes.
-
-    Launched over view, instance, row, column.
-    """
+    """Make one binary mask per instance: visible masks from the id image or, if `is_amodal`, amodal masks from their boxes. Launched over
+    view, instance, row, column."""
     view, index, row, column = wp.tid()
     if is_amodal:
         mask_out[view, index, row, column] = has_pixel(masks, view, read_mask(masks, view, index), row, column)

@@ -35,9 +35,7 @@ LEAST_LIGHT = wp.constant(1.0e-4)
 @wp.func
 def dot_pattern(column: float, row: float, spacing: float) -> float:
     """Projected pattern at a place of the projector's image [px]: in each cell, `spacing` wide, a Gaussian dot at a random place.
-
-    Stratified places have no large gaps, and repeat nowhere, as those of a lattice would, so that each window has one match.
-    """
+    Stratified places have no large gaps, and repeat nowhere, as those of a lattice would, so that each window has one match."""
     x = int(wp.floor(column / spacing))
     y = int(wp.floor(row / spacing))
     light = float(0.0)

@@ -51,11 +51,8 @@ def clear_sources(kept: KeptSources, row: int, footprint: int, samples: int):
 
 @wp.kernel
 def forget_sources_kernel(grid: ImageGrid, flags: TileFlags, samples: int, kept_inout: KeptSources):
-    """Cache invalidation: set the sources of all footprints with a corner pixel in a damaged tile to unknown.
-
-    A tile of H x W pixels touches (H + 1) x (W + 1) footprints; the bits of those in one row are consecutive. Launched over view, tile, row
-    of footprints.
-    """
+    """Cache invalidation: set the sources of all footprints with a corner pixel in a damaged tile to unknown. A tile of H x W pixels
+    touches (H + 1) x (W + 1) footprints; the bits of those in one row are consecutive. Launched over view, tile, row of footprints."""
     view, tile, down = wp.tid()
     if (int(flags.dirty[view, tile]) & DAMAGED) == 0:
         return

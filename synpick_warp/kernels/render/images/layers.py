@@ -202,9 +202,7 @@ def albedo_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row:
 @wp.func
 def nocs_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.vec3:
     """NOCS map, normalized object coordinates (Wang et al., 2019): (p - c) / |u - l| + 1/2, c = (l + u) / 2, l and u the mesh's bounds.
-
-    Zero stands for no instance, or one without label: no point of an object with an extent has 0 in all three components.
-    """
+    Zero stands for no instance, or one without label: no point of an object with an extent has 0 in all three components."""
     segment = int(shot.gbuffer.segment[view, row, column])
     coordinates = wp.vec3(0.0, 0.0, 0.0)
     if segment != Segment.NOTHING and segment <= shot.views.instances:
@@ -255,11 +253,8 @@ def displacement_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int
 
 @wp.func
 def flow_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.vec2:
-    """Backward optical flow [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike;
-    through a lens, the difference of both places.
-
-    NaN where the displacement d is unknown, and where the point was behind the camera.
-    """
+    """Backward optical flow [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike; through a lens,
+    the difference of both places. NaN where the displacement d is unknown, and where the point was behind the camera."""
     cameras = shot.views.cameras
     intrinsics = cameras.intrinsics[view]
     ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))

@@ -90,10 +90,8 @@ def list_boundaries_kernel(
     # Out:
     runs_out: Boundaries,
 ):
-    """Write the run boundaries of the segmentation ids as a list sorted by column, then row: second pass of a stream compaction.
-
-    Launched over view, band, column.
-    """
+    """Write the run boundaries of the segmentation ids as a list sorted by column, then row: second pass of a stream compaction. Launched
+    over view, band, column."""
     view, band, column = wp.tid()
     rows, bands = instance_image.shape[1], counts.band_count.shape[1]
     index = int(0)
@@ -146,9 +144,7 @@ def lane_columns(mask: Mask, lanes: int) -> int:
 @wp.kernel
 def count_runs_kernel(masks: InstanceMasks, counts_out: BoundaryCounts, runs_inout: Boundaries):
     """Count the run boundaries of each amodal mask: first pass of a stream compaction, in which a lane has consecutive columns of a mask.
-
-    `run_count` is increased by the sums over the lanes. Launched over view, instance, lane.
-    """
+    `run_count` is increased by the sums over the lanes. Launched over view, instance, lane."""
     view, instance, lane = wp.tid()
     mask = read_mask(masks, view, instance)
     share = lane_columns(mask, counts_out.lane_count.shape[2])

@@ -44,11 +44,8 @@ def filmic_curve(linear: float) -> float:
 
 @wp.func
 def encode_display(linear: float, tone: int) -> wp.uint8:
-    """Tone-map a linear value by the curve `tone` (a `Tone`) and encode it as an sRGB byte.
-
-    SHOULDER: linear up to SHOULDER_START, then an exponential shoulder that reaches 1 at infinity, with slope 1 where they meet.
-    LINEAR: clipped at 1. FILMIC: `filmic_curve`.
-    """
+    """Tone-map a linear value by the curve `tone` (a `Tone`) and encode it as an sRGB byte. SHOULDER: linear up to SHOULDER_START, then an
+    exponential shoulder that reaches 1 at infinity, with slope 1 where they meet. LINEAR: clipped at 1. FILMIC: `filmic_curve`."""
     x = wp.max(linear, 0.0)
     if tone == Tone.FILMIC:
         x = filmic_curve(x)
@@ -173,9 +170,7 @@ def filter_lens_rows_kernel(
     radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
     """First pass of the separable lens filter: resolve, vignette, then blur and chromatic aberration along rows; see `filter_lens`.
-
-    `radiance_out` receives linear radiance before exposure. Launched over view, pixel (tile order, from flat index `first` on).
-    """
+    `radiance_out` receives linear radiance before exposure. Launched over view, pixel (tile order, from flat index `first` on)."""
     view, row, column = tile_pixel(shot.grid, wp.tid() + first)
     if not in_image(shot.grid, row, column):
         return

@@ -110,17 +110,7 @@ def move_cameras_kernel(
 
 
 @wp.kernel
-def expose_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # In:
-    shown: ShadedImage,
-    sub_frame: SubFrame,
-    index: int,
-    first: int,
-    # Out:
-    image_inout: ShadedImage,
-):
+def expose_kernel(grid: ImageGrid, shown: ShadedImage, sub_frame: SubFrame, index: int, first: int, image_inout: ShadedImage):
     """Add the radiance of sub-frame `index`, `shown`, to the picture of views in which anything moves, with its weight in the row; the
     first one replaces the picture. Launched over view, pixel (tile order, from flat index `first` on)."""
     view, row, column = tile_pixel(grid, wp.tid() + first)

@@ -238,11 +238,8 @@ def sub_pixel(before: int, here: int, after: int) -> int:
 def match_left_kernel(
     grid: ImageGrid, sensor: SensorParameters, views: AnyViews, first_view: int, first: int, matching_inout: MatchingScratch
 ):
-    """Sub-pixel disparity of each pixel of left images, NO_MATCH where there is none.
-
-    The cheapest disparity must be unique, not at an end of the search, and within MAX_DIFFERENCE of its partner's. Launched over slot,
-    pixel (tile order, from flat index `first` on).
-    """
+    """Sub-pixel disparity of each pixel of left images, NO_MATCH where there is none. The cheapest disparity must be unique, not at an end
+    of the search, and within MAX_DIFFERENCE of its partner's. Launched over slot, pixel (tile order, from flat index `first` on)."""
     slot, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
@@ -302,9 +299,7 @@ def measure_depth_kernel(
     depth_stereo_out: wp.array3d[wp.uint16],  # (view, row, column) [counts]
 ):
     """Depth f b / d of the filtered disparity, in steps of `disparity_step`; 0 (hole): no match, or outside of the measuring range.
-
-    Launched over slot, pixel (tile order, from flat index `first` on).
-    """
+    Launched over slot, pixel (tile order, from flat index `first` on)."""
     slot, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return

@@ -90,10 +90,8 @@ def rim_point(cup: PlacedCup, radius: float, index: int) -> wp.vec3:
 
 @wp.func
 def seal_score(meshes: Meshes, mesh: int, cup: PlacedCup, radius: float) -> float:
-    """Seal score: min over edges (length in the plane / length on the surface) x exp(-FLATNESS x variance of the lip's heights).
-
-    0 if the lip meets no surface somewhere, or the object stands in the cup's way.
-    """
+    """Seal score: min over edges (length in the plane / length on the surface) x exp(-FLATNESS x variance of the lip's heights). 0 if the
+    lip meets no surface somewhere, or the object stands in the cup's way."""
     above = 2.0 * meshes.radius[mesh]
     chord = 2.0 * radius * wp.sin(0.5 * TAU / float(RIM_POINTS))
     total = float(0.0)
@@ -211,9 +209,7 @@ def score_points_kernel(
     seal_out: wp.array[float],  # (point)
 ):
     """Seal scores of a cup of `radius` [m] on points of the meshes, in each mesh's frame: `samples` points of the first, and so on.
-
-    Launched over point.
-    """
+    Launched over point."""
     index = wp.tid()
     cup = PlacedCup()
     cup.point = point[index]

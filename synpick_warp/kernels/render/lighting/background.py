@@ -20,8 +20,7 @@ HORIZON = wp.constant(0.02)
 @wp.func
 def floor_radiance(scene: RandomizedScene, drop: float, shot: AnyShot, view: int, light: int, direction: wp.vec3) -> wp.vec3:
     """Radiance of the floor, `drop` [m] below the table, along a unit direction in the world, which points down: diffuse, in unoccluded
-    light.
-    """
+    light."""
     cameras = shot.views.cameras
     center = wp.vec3(cameras.center[view])
     distance = wp.max(center[2] - scene.table.height + drop, 0.0) / -direction[2]

@@ -229,9 +229,7 @@ def schlick_weight(cosine: float) -> float:
 @wp.func
 def sample_ggx_vndf(outgoing: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
     """Sample a microfacet normal from the GGX distribution of visible normals (VNDF), by spherical caps (Dupuy and Benyoub, 2023).
-
-    Directions are in the shading frame; `u` is uniform in [0, 1)².
-    """
+    Directions are in the shading frame; `u` is uniform in [0, 1)²."""
     warped = wp.normalize(wp.vec3(alpha * outgoing[0], alpha * outgoing[1], outgoing[2]))
     angle = wp.TAU * u[0]
     z = (1.0 - u[1]) * (1.0 + warped[2]) - warped[2]
@@ -368,10 +366,8 @@ def brdf_pdf(brdf: Brdf, incoming: wp.vec3) -> float:
 
 @wp.func
 def sample_brdf(brdf: Brdf, choice: float, u: wp.vec2) -> wp.vec3:
-    """Sample an incoming direction: from the GGX lobe if `choice` < specular_probability, else cosine-weighted.
-
-    `choice` and `u` are uniform in [0, 1). A direction below the surface carries no light.
-    """
+    """Sample an incoming direction: from the GGX lobe if `choice` < specular_probability, else cosine-weighted. `choice` and `u` are
+    uniform in [0, 1). A direction below the surface carries no light."""
     o = to_local(brdf, brdf.outgoing)
     i = wp.vec3(0.0, 0.0, 1.0)
     if choice < brdf.specular_probability:
@@ -389,10 +385,8 @@ def measure_albedo_kernel(
     # Out:
     albedo_out: wp.array2d[wp.vec2],  # (roughness, cosine)
 ):
-    """Measure the directional albedo table: the mean of (1 - s, s) G₂ / G₁ over sampled visible normals, s Schlick's weight.
-
-    Launched over row (roughness), column (√cosine).
-    """
+    """Measure the directional albedo table: the mean of (1 - s, s) G₂ / G₁ over sampled visible normals, s Schlick's weight. Launched over
+    row (roughness), column (√cosine)."""
     row, column = wp.tid()
     roughness = float(row) / float(ALBEDO_ROWS - 1)
     root = float(column) / float(ALBEDO_COLUMNS - 1)

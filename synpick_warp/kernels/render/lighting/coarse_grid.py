@@ -48,10 +48,8 @@ def flat_index(grid: ImageGrid, view: int, row: int, column: int) -> int:
 
 @wp.func
 def pack_surface(segment: int, depth: float, normal: wp.vec3) -> wp.vec4:
-    """Pack a surface: x and y of its shading normal in camera space, planar depth [m], and segmentation id.
-
-    The id is negative where the normal points away from the camera; so z of the normal, a unit vector, follows from x and y.
-    """
+    """Pack a surface: x and y of its shading normal in camera space, planar depth [m], and segmentation id. The id is negative where the
+    normal points away from the camera; so z of the normal, a unit vector, follows from x and y."""
     return wp.vec4(normal[0], normal[1], depth, wp.where(normal[2] > 0.0, -float(segment), float(segment)))
 
 
@@ -105,10 +103,8 @@ def middle_pixel(coarse: CoarseGrid, row: int, column: int) -> wp.vec2i:
 
 @wp.func
 def morton_index(period: int, row: int, column: int) -> int:
-    """Morton code (Z-order) of a coarse pixel within squares of `period` (2 to 16) pixels: which of period² sample points it takes.
-
-    The bits of row and column are interleaved, so that aligned squares of 2^k pixels hold aligned runs of 4^k indices.
-    """
+    """Morton code (Z-order) of a coarse pixel within squares of `period` (2 to 16) pixels: which of period² sample points it takes. The
+    bits of row and column are interleaved, so that aligned squares of 2^k pixels hold aligned runs of 4^k indices."""
     index = int(0)
     for bit in range(4):
         if (1 << bit) < period:
@@ -125,11 +121,8 @@ def coarse_coordinate(coarse: CoarseGrid, pixel: int) -> float:
 
 @wp.func
 def interleaved_pixel(coarse: CoarseGrid, index: int) -> tuple[int, int, int]:
-    """(view, row, column) of a thread in interleaved order; row or column may lie outside the grid.
-
-    The threads of a warp take coarse pixels LANE_STRIDE apart, whose sample points are close together: their rays are nearly parallel and
-    visit the same BVH nodes.
-    """
+    """(view, row, column) of a thread in interleaved order; row or column may lie outside the grid. The threads of a warp take coarse
+    pixels LANE_STRIDE apart, whose sample points are close together: their rays are nearly parallel and visit the same BVH nodes."""
     # Unsigned, as in `tile_pixel`.
     lanes, stride, columns = wp.uint32(TILE_PIXELS), wp.uint32(LANE_STRIDE), wp.uint32(LANE_COLUMNS)
     across = stride * columns
@@ -162,9 +155,7 @@ class CoarseSurface:
 
 @wp.func
 def coarse_surface(coarse: CoarseGrid, shot: AnyShot, view: int, row: int, column: int) -> CoarseSurface:
-    """Surface that a coarse pixel shows: hit, position, direction to the camera and footprint, read from the G-buffer at its
-    middle pixel.
-    """
+    """Surface that a coarse pixel shows: hit, position, direction to the camera and footprint, from the G-buffer at its middle pixel."""
     cameras = shot.views.cameras
     pixel = middle_pixel(coarse, row, column)
     ray = camera_ray(cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))

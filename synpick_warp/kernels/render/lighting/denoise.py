@@ -76,10 +76,8 @@ def any_due(flags: TileFlags, grid: ImageGrid, view: int, tile: int, reach: int)
 
 @wp.kernel
 def plan_stages_kernel(grid: ImageGrid, flags_inout: TileFlags):
-    """Plan the stages of each tile of coarse pixels, so that all that the ratios of `due` tiles depend on is computed.
-
-    Launched over view, tile of coarse pixels.
-    """
+    """Plan the stages of each tile of coarse pixels, so that all that the ratios of `due` tiles depend on is computed. Launched over view,
+    tile of coarse pixels."""
     view, tile = wp.tid()
     stages = int(flags_inout.due[view, tile]) * RATIO_STAGE
     if any_due(flags_inout, grid, view, tile, 1):
@@ -171,10 +169,8 @@ def add_light(total: KernelSum, one: KernelSum, weight: float) -> KernelSum:
 
 @wp.func
 def row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, row: int, column: int, r: int, start: int, stride: int) -> wp.vec4:
-    """Bilateral weights of four coarse pixels in row `r`, at column offsets `start`, `start + stride`, ...; 0 outside the image.
-
-    `row` and `column` are those of the plane's own coarse pixel.
-    """
+    """Bilateral weights of four coarse pixels in row `r`, at column offsets `start`, `start + stride`, ...; 0 outside the image. `row` and
+    `column` are those of the plane's own coarse pixel."""
     weights = wp.vec4()
     if r < 0 or r >= grid.height:
         return weights
@@ -259,9 +255,7 @@ def filter_blocks_kernel(
 @wp.func
 def shrink(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
     """Shrinkage estimator (James and Stein, 1961): interpolates from `wide` to `narrow` where their squared difference exceeds `variance`.
-
-    `variance` is that of `narrow`; the larger the difference is relative to it, the closer is the result to `narrow`.
-    """
+    `variance` is that of `narrow`; the larger the difference is relative to it, the closer is the result to `narrow`."""
     difference = luminance(narrow) - luminance(wide)
     square = difference * difference
     if square <= variance:
@@ -285,15 +279,10 @@ def firefly_variance(wide: wp.vec3, narrow: wp.vec3, pooled: float, own: float) 
 def choose_ratio(
     wide: wp.vec3, medium: wp.vec3, narrow: wp.vec3, medium_weight: float, pooled: float, medium_sum: float, narrow_variance: float
 ) -> wp.vec3:
-    """Visibility ratio of the widest kernel that agrees with the narrower ones; the medium kernel is skipped where its weight is 0.
-
-    Args:
-        wide, medium, narrow: Ratios of the three kernels.
-        medium_weight: Sum of the weights of the medium kernel's blocks.
-        pooled: Mean variance of a block's ratio over the wide kernel.
-        medium_sum: Weighted sum of the variances of the medium kernel's blocks.
-        narrow_variance: Variance of the narrow kernel's ratio.
-    """
+    """Visibility ratio of the widest kernel that agrees with the narrower ones; the medium kernel is skipped where its weight is 0. `wide`,
+    `medium`, `narrow`: ratios of the three kernels. `medium_weight`: sum of the weights of the medium kernel's blocks. `pooled`: mean
+    variance of a block's ratio over the wide kernel. `medium_sum`: weighted sum of the variances of the medium kernel's blocks.
+    `narrow_variance`: variance of the narrow kernel's ratio."""
     result = wide
     if medium_weight > 0.0:
         result = shrink(result, medium, firefly_variance(result, medium, pooled, medium_sum / medium_weight) / MEDIUM_BLOCKS)

@@ -69,10 +69,8 @@ def touch_bodies(moving: MovingBodies, view: int, word: int, members: wp.uint64)
 
 @wp.kernel
 def mark_damaged_tiles_kernel(bodies: ViewBodies, moving_inout: MovingBodies, flags_inout: TileFlags):
-    """Mark the tiles whose bodies changed since the previous frame, and the bodies in them; all if that frame is not kept.
-
-    Writes `dirty`, `bodies` and, where that frame is kept, `touched`. Launched over view, tile.
-    """
+    """Mark the tiles whose bodies changed since the previous frame, and the bodies in them; all if that frame is not kept. Writes `dirty`,
+    `bodies` and, where that frame is kept, `touched`. Launched over view, tile."""
     view, tile = wp.tid()
     kept = flags_inout.kept_row[view]
     dirty = flags_inout.holds[view] == 0

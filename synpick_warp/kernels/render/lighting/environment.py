@@ -142,10 +142,8 @@ def read_texel(lights: Lights, index: int) -> wp.vec3:
 
 @wp.func
 def environment_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.vec3:
-    """Radiance from a unit direction in the map's frame, bilinear.
-
-    `light` is a row of `Lights.radiance`: the index of a map, or that plus `maps` for the map without its lamps.
-    """
+    """Radiance from a unit direction in the map's frame, bilinear. `light` is a row of `Lights.radiance`: the index of a map, or that plus
+    `maps` for the map without its lamps."""
     rows = lights.radiance.shape[1]
     columns = lights.radiance.shape[2]
     taps = find_taps(direction, rows, columns)
@@ -188,10 +186,8 @@ def prefiltered_radiance(lights: Lights, light: int, direction: wp.vec3, roughne
 
 @wp.func
 def sh_irradiance(lights: Lights, light: int, normal: wp.vec3) -> wp.vec3:
-    """Irradiance by spherical harmonics of order 2 (Ramamoorthi and Hanrahan, 2001), without the lamps; clamped at zero.
-
-    `normal` is a unit vector in the map's frame.
-    """
+    """Irradiance by spherical harmonics of order 2 (Ramamoorthi and Hanrahan, 2001), without the lamps; clamped at zero. `normal` is a unit
+    vector in the map's frame."""
     x = normal[0]
     y = normal[1]
     z = normal[2]

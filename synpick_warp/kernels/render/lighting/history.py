@@ -70,10 +70,7 @@ class LightHistory:
 @kernel_of_views
 def advance_history_kernel(snapshot: Frames, views: AnyViews, history_inout: LightHistory, moving_out: MovingBodies, flags_out: TileFlags):
     """Write `holds` (the history contains the previous frame of the same episode), set episode and frame of the history to this frame's,
-    and choose the rows of `flags_out`: a view of which nothing is kept gets one behind the kept ones, as scratch.
-
-    Launched over view.
-    """
+    and choose the rows of `flags_out`: a view of which nothing is kept gets one behind the kept ones, as scratch. Launched over view."""
     view = wp.tid()
     world = views.world[view]
     slot = world * history_inout.cameras + views.slot[view]
@@ -136,10 +133,8 @@ def lag_limit(
     segment: int,
     point: wp.vec3,
 ) -> int:
-    """Maximum history length of a coarse pixel [frames], from the body's displacement and the change of its light (`lag_frames`).
-
-    0 rejects the history: another segmentation id was visible, the body moved too far, or the previous frame is missing.
-    """
+    """Maximum history length of a coarse pixel [frames], from the body's displacement and the change of its light (`lag_frames`). 0 rejects
+    the history: another segmentation id was visible, the body moved too far, or the previous frame is missing."""
     if history.max_paths == 0 or moving.holds[view] == 0:
         return 0
     slot = shot.views.world[view] * history.cameras + shot.views.slot[view]
@@ -156,10 +151,8 @@ def lag_limit(
 
 @wp.func
 def period_bits(paths: int, limit: int) -> int:
-    """Binary logarithm of a coarse pixel's update period: with 2, 4, 8 paths it traces one every 2, 4, 8 frames; 0: every frame.
-
-    The period is shortened until MIN_SKIP_PATHS periods fit into `limit` frames, see `lag_limit`.
-    """
+    """Binary logarithm of a coarse pixel's update period: with 2, 4, 8 paths it traces one every 2, 4, 8 frames; 0: every frame. The period
+    is shortened until MIN_SKIP_PATHS periods fit into `limit` frames, see `lag_limit`."""
     bits = int(0)
     while bits < MAX_PERIOD_BITS and (MIN_SKIP_PATHS << bits) <= paths and (MIN_SKIP_PATHS << (bits + 1)) <= limit:
         bits += 1
@@ -178,10 +171,8 @@ def usable_paths(history: LightHistory, slot: int, row: int, column: int, limit:
 
 @wp.func
 def path_number(frame: int, bits: int) -> int:
-    """Index of a coarse pixel's path in its sequence, distinct within a history of default length that begins in any frame.
-
-    Each update period has a part of the sequence of its own, PERIOD_PATHS long, and takes its paths in order.
-    """
+    """Index of a coarse pixel's path in its sequence, distinct within a history of default length that begins in any frame. Each update
+    period has a part of the sequence of its own, PERIOD_PATHS long, and takes its paths in order."""
     return (frame >> bits) % PERIOD_PATHS + PERIOD_PATHS * bits
 
 
@@ -255,13 +246,9 @@ def write_history(history: LightHistory, slot: int, row: int, column: int, segme
 def accumulate(
     history: LightHistory, slot: int, row: int, column: int, segment: int, light: SplitRadiance, known: int, samples: int
 ) -> SplitRadiance:
-    """Add the light of new paths to a coarse pixel's history, and return the new average.
-
-    Args:
-        light: Mean of the new paths, pre-exposed.
-        known: Paths of the history that are kept; 0: it is replaced.
-        samples: Number of new paths; 1 if `known` is above 0, so that the new path has the weight 1 / (known + 1).
-    """
+    """Add the light of new paths to a coarse pixel's history, and return the new average. `light`: mean of the new paths, pre-exposed.
+    `known`: paths of the history that are kept; 0: it is replaced. `samples`: number of new paths; 1 if `known` is above 0, so that the new
+    path has the weight 1 / (known + 1)."""
     average = light
     if known > 0:
         average = blend_light(read_history(history, slot, row, column), light, 1.0 / float(known + 1))

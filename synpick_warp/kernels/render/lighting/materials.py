@@ -67,10 +67,8 @@ def make_table_surface(meshes: Meshes, surfaces: AnySurfaces, bodies: ViewBodies
 
 @wp.func
 def map_table(surfaces: Surfaces, surface: Surface, position: wp.vec3, view_direction: wp.vec3, pixel_width: float) -> Surface:
-    """The table's shading data with texture coordinates, the horizontal axes of the world, if its material may have a texture.
-
-    Arguments as of `interpolate_surface`; `position` in the world [m].
-    """
+    """The table's shading data with texture coordinates, the horizontal axes of the world, if its material may have a texture. Arguments as
+    of `interpolate_surface`; `position` in the world [m]."""
     return surface
 
 
@@ -174,10 +172,8 @@ def interpolate_surface(
     view_direction: wp.vec3,
     pixel_width: float,
 ) -> Surface:
-    """Interpolate the shading data of a mesh at a hit.
-
-    `view_direction` points to the viewer; `pixel_width` [m] is the pixel's footprint across the ray.
-    """
+    """Interpolate the shading data of a mesh at a hit. `view_direction` points to the viewer; `pixel_width` [m] is the pixel's footprint
+    across the ray."""
     mesh = bodies.mesh[view, body]
     to_world = wp.transpose(bodies.world_rotation[view, body])
     result = Surface()
@@ -230,10 +226,7 @@ class Taps:
 
 @wp.func
 def find_taps(surfaces: AnySurfaces, row: int, level: int, uv: wp.vec2) -> Taps:
-    """Texels about a place in one mip level of a repeating texture.
-
-    v grows upward, row 0 is the image's top; `row` is that of `Surfaces`.
-    """
+    """Texels about a place in a mip level of a repeating texture. v grows upward, row 0 is the image's top; `row` is that of `Surfaces`."""
     size = surfaces.texture_size[row]
     width = wp.max(size[0] >> level, 1)
     height = wp.max(size[1] >> level, 1)

@@ -49,10 +49,8 @@ def reverse_bits(x: wp.uint32) -> wp.uint32:
 
 @wp.func
 def permute_laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
-    """Laine-Karras permutation (2011) with Vegdahl's constants (2021): hash-based Owen scrambling of reversed bits.
-
-    Each bit of the result depends on the bits below it alone.
-    """
+    """Laine-Karras permutation (2011) with Vegdahl's constants (2021): hash-based Owen scrambling of reversed bits. Each bit of the result
+    depends on the bits below it alone."""
     y = x ^ (x * wp.uint32(0x3D20ADEA))
     y = y + seed
     y = y * ((seed >> wp.uint32(16)) | wp.uint32(1))
@@ -93,10 +91,8 @@ def rotate_to_axis(axis: wp.vec3, local: wp.vec3) -> wp.vec3:
 
 @wp.func
 def scrambled_point(key: wp.uint64, index: int, dimension: int) -> wp.vec2:
-    """Shuffled, Owen-scrambled Sobol' point `index` in [0, 1)² (Burley, 2020); each (key, dimension) has its own scrambling.
-
-    Aligned runs of 2^k indices stay stratified; points of different dimensions or keys are uncorrelated.
-    """
+    """Shuffled, Owen-scrambled Sobol' point `index` in [0, 1)² (Burley, 2020); each (key, dimension) has its own scrambling. Aligned runs
+    of 2^k indices stay stratified; points of different dimensions or keys are uncorrelated."""
     bits = mix(key + wp.uint64(dimension + 1) * GAMMA)
     order = wp.uint32(bits)
     across = wp.uint32(bits >> wp.uint64(32))
@@ -164,10 +160,8 @@ def invert_conditional(cdf: EnvironmentCdf, light: int, row: int, u: float) -> i
 
 @wp.func
 def sample_environment(cdf: EnvironmentCdf, light: int, u: wp.vec2) -> EnvironmentSample:
-    """Sample a direction in proportion to the texels' weights (luminance times solid angle), uniformly within a texel.
-
-    `u` is uniform in [0, 1)²; see `stages.render.light_tables.environment_cdf` for the weights.
-    """
+    """Sample a direction in proportion to the texels' weights (luminance times solid angle), uniformly within a texel. `u` is uniform in
+    [0, 1)²; see `stages.render.light_tables.environment_cdf` for the weights."""
     rows = cdf.conditional.shape[1]
     columns = cdf.conditional.shape[2] - 1
     row = invert_marginal(cdf, light, u[0])

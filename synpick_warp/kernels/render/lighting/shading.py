@@ -82,10 +82,8 @@ class PixelLight:
 def lamp_light(
     tables: AlbedoTables, lights: Lights, light: int, yaw: float, brdf: Brdf, face_normal: wp.vec3, visible: wp.uint64
 ) -> wp.vec3:
-    """Radiance of the lamps' light that a surface reflects towards the camera; `visible` as in `PixelLight.lamps`.
-
-    Lamps behind the triangle, whose geometric normal is `face_normal`, give no light, whatever the interpolated normal says.
-    """
+    """Radiance of the lamps' light that a surface reflects towards the camera; `visible` as in `PixelLight.lamps`. Lamps behind the
+    triangle, whose geometric normal is `face_normal`, give no light, whatever the interpolated normal says."""
     result = wp.vec3()
     if visible == wp.uint64(0):
         return result
@@ -154,15 +152,10 @@ def sum_of(values: wp.vec3) -> float:
 
 @wp.func
 def move_weights(center: wp.vec3, orientation: float, areas: wp.vec3) -> tuple[wp.vec3, float]:
-    """Move barycentric weights from a pixel's center towards a shading sample, by at most MAX_WEIGHT_CHANGE.
+    """Move barycentric weights from a pixel's center towards a shading sample, by at most MAX_WEIGHT_CHANGE. `center`: weights at the
+    pixel's center. `orientation`: sign of the sum of `edge_areas` there, 1 or -1. `areas`: `edge_areas` at the sample.
 
-    Args:
-        center: Weights at the pixel's center.
-        orientation: Sign of the sum of `edge_areas` there, 1 or -1.
-        areas: `edge_areas` at the sample.
-
-    Returns the weights, and how far they moved as a fraction of the way: 0 if the sample's ray does not meet the triangle's plane.
-    """
+    Returns the weights, and how far they moved as a fraction of the way: 0 if the sample's ray does not meet the triangle's plane."""
     # The sum may be small: all quantities are multiplied by it, so that no quotient overflows.
     total = orientation * sum_of(areas)
     if total <= 0.0:

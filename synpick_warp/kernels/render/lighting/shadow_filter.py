@@ -120,15 +120,9 @@ def shadow_segment(record: wp.vec4) -> wp.uint8:
 
 @wp.func
 def lamp_fractions(even: wp.uint64, odd: wp.uint64, weight: int, lamps: int, rays: int) -> wp.uint64:
-    """Visible fractions of the lamps, byte k that of lamp k in 1/255, from weighted sums of unblocked rays.
-
-    Args:
-        even: Sums of the rays with an even index, 16 bits each.
-        odd: Sums of the rays with an odd index, 16 bits each.
-        weight: Sum of the weights.
-        lamps: Number of lamps.
-        rays: Rays to each lamp.
-    """
+    """Visible fractions of the lamps, byte k that of lamp k in 1/255, from weighted sums of unblocked rays. `even`: sums of the rays with
+    an even index, 16 bits each. `odd`: sums of the rays with an odd index, 16 bits each. `weight`: sum of the weights. `lamps`: number of
+    lamps. `rays`: rays to each lamp."""
     result = wp.uint64(0)
     samples = weight * rays
     for lamp in range(lamps):
@@ -156,10 +150,8 @@ def grid_plane(meshes: Meshes, coarse: CoarseGrid, shot: AnyShot, view: int, row
 
 @wp.func
 def same_surface(coarse: CoarseGrid, plane: Plane, down: int, right: int, depth: float, segment: wp.uint8, normal: int) -> bool:
-    """Whether a surface seen `down` rows and `right` columns of pixels from the plane's own pixel lies in it, on the same body.
-
-    `normal` is packed by `pack_normal`.
-    """
+    """Whether a surface seen `down` rows and `right` columns of pixels from the plane's own pixel lies in it, on the same body. `normal` is
+    packed by `pack_normal`."""
     near = plane_distance(plane, down, right, depth) <= PLANE_TOLERANCE * float(coarse.size) * plane.width
     return near and segment == plane.segment and wp.abs(wp.dot(unpack_normal(normal), plane.normal)) > MIN_COSINE
 
@@ -263,12 +255,8 @@ def steepness_levels(lowest: int, highest: int, share: float, supported: bool) -
     """Steepness of a lamp's shadow at a pixel, from 0 to STEEPNESS_LEVELS.
 
     It grows with the range of the visible fraction, weighted by the lamp's share. Without support it is STEEPNESS_LEVELS, unless the lamp
-    is entirely visible or entirely hidden around the pixel (0).
-
-    Args:
-        lowest, highest: Extremes of the visible fraction around the pixel [1/255].
-        share: Share of the lamp, see FULL_SHARE.
-        supported: Whether at least MIN_SUPPORT pixels around are on the pixel's surface.
+    is entirely visible or entirely hidden around the pixel (0). `lowest`, `highest`: extremes of the visible fraction around the pixel
+    [1/255]. `share`: share of the lamp, see FULL_SHARE. `supported`: whether at least MIN_SUPPORT pixels around are on the pixel's surface.
     """
     if share < MIN_SHARE:
         return 0
@@ -294,10 +282,8 @@ def range_steepness(lights: Lights, which: int, extremes: FractionRange, support
 
 @wp.func
 def mark_edges(coarse: CoarseGrid, near_edge: wp.array3d[wp.uint8], view: int, row: int, column: int, reach: int):
-    """Set `near_edge` to 1 at the pixels of the shadow grid from (row - `reach`, column - `reach`) to (row + 1, column + 1).
-
-    All threads write the same value.
-    """
+    """Set `near_edge` to 1 at the pixels of the shadow grid from (row - `reach`, column - `reach`) to (row + 1, column + 1). All threads
+    write the same value."""
     for r in range(wp.max(row - reach, 0), wp.min(row + 2, coarse.grid.height)):
         for c in range(wp.max(column - reach, 0), wp.min(column + 2, coarse.grid.width)):
             near_edge[view, r, c] = wp.uint8(1)

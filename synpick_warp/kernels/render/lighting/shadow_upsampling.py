@@ -116,10 +116,8 @@ def find_shadow_taps(shadows: LampShadows, coarse: CoarseGrid, view: int, row: i
 
 @wp.func
 def all_steepness(taps: ShadowTaps) -> wp.uint32:
-    """Bitwise union of the taps' steepness, STEEPNESS_BITS for each lamp: above 0 where the shadow is steep at any tap.
-
-    All bits are set if no tap shows the pixel's surface.
-    """
+    """Bitwise union of the taps' steepness, STEEPNESS_BITS for each lamp: above 0 where the shadow is steep at any tap. All bits are set if
+    no tap shows the pixel's surface."""
     steepness = taps.steepness[0] | taps.steepness[1] | taps.steepness[2] | taps.steepness[3]
     return wp.where(taps.found, steepness, ~wp.uint32(0))
 
@@ -185,9 +183,7 @@ def sum_edges(shadows: LampShadows, coarse: CoarseGrid, gbuffer: GBuffer, view: 
 @wp.func
 def edge_fraction(sums: EdgeSums, lamp: int, rays: int, fallback: float) -> float:
     """Visible fraction of a lamp [1/255]: weighted number of unblocked shadow rays divided by that of all; `rays` is the number per pixel.
-
-    `fallback` where no pixel in the window traced a ray to the lamp.
-    """
+    `fallback` where no pixel in the window traced a ray to the lamp."""
     shift = wp.uint32(8 * (lamp >> 1))
     values = int((wp.where(lamp & 1 == 0, sums.even, sums.odd) >> shift) & wp.uint32(0xFF))
     weight = int((wp.where(lamp & 1 == 0, sums.even_weight, sums.odd_weight) >> shift) & wp.uint32(0xFF))

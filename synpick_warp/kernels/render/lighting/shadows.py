@@ -58,10 +58,8 @@ def pack_last(segment: int, rays: int) -> wp.uint16:
 
 @wp.func
 def pack_rays(rays: int, depth: float, segment: int, normal: int) -> wp.uint64:
-    """Pack the bits of a pixel's shadow rays (1: unblocked) with segmentation id, depth [m] and packed normal of the surface.
-
-    The filter thus reads each neighbour once. Ray j to lamp k has bit k * `Lights.lamp_rays` + j.
-    """
+    """Pack the bits of a pixel's shadow rays (1: unblocked) with segmentation id, depth [m] and packed normal of the surface. The filter
+    thus reads each neighbour once. Ray j to lamp k has bit k * `Lights.lamp_rays` + j."""
     return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64((normal << 16) | (segment << 8) | rays)
 
 
@@ -145,10 +143,8 @@ def meets_box(origin: wp.vec3, inverse: wp.vec3, lower: wp.vec3, upper: wp.vec3)
 
 @wp.func
 def may_change(moving: MovingBodies, view: int, origin: wp.vec3, direction: wp.vec3) -> bool:
-    """Whether a moving body may block a ray now, or may have blocked it in the previous frame.
-
-    Tests the union of the moving bodies' bounding boxes first, then each box. `MovingBodies.count` must be above 0.
-    """
+    """Whether a moving body may block a ray now, or may have blocked it in the previous frame. Tests the union of the moving bodies'
+    bounding boxes first, then each box. `MovingBodies.count` must be above 0."""
     inverse = wp.vec3()
     for i in range(3):
         inverse[i] = 1.0 / wp.where(wp.abs(direction[i]) < MIN_DIRECTION, MIN_DIRECTION, direction[i])
@@ -186,10 +182,8 @@ def is_shadowed(scene: PathScene, shot: AnyShot, view: int, position: wp.vec3, n
 def last_rays(
     history: LightHistory, moving: MovingBodies, shot: AnyShot, view: int, slot: int, row: int, column: int, segment: int
 ) -> tuple[bool, int]:
-    """Temporal reuse: (True, bits of a pixel's shadow rays in the previous frame) if these may be reused, else (False, 0).
-
-    They may if the history contains that frame, and the pixel showed the same body, which `rests`. `slot`: row of the history.
-    """
+    """Temporal reuse: (True, bits of a pixel's shadow rays in the previous frame) if these may be reused, else (False, 0). They may if the
+    history contains that frame, and the pixel showed the same body, which `rests`. `slot`: row of the history."""
     if moving.holds[view] == 0:
         return False, 0
     last = int(history.shadows[slot, row, column])

@@ -24,11 +24,8 @@ def max_channels(a: wp.vec3, b: wp.vec3) -> wp.vec3:
 
 @wp.func
 def unoccluded_light(lights: Lights, light: int, yaw: float, brdf: Brdf) -> SplitRadiance:
-    """Radiance reflected from an unoccluded environment map without its lamps; nothing is indirect.
-
-    Diffuse by spherical harmonics, specular by the split-sum approximation (Karis, 2013). `light` is the index of the map, rotated by `yaw`
-    [rad] about +z.
-    """
+    """Radiance reflected from an unoccluded environment map without its lamps; nothing is indirect. Diffuse by spherical harmonics,
+    specular by the split-sum approximation (Karis, 2013). `light` is the index of the map, rotated by `yaw` [rad] about +z."""
     radiance = SplitRadiance()
     floor = max_channels(
         MIN_UNOCCLUDED * lights.irradiance[light, 0] * SH_CONSTANT, MIN_EXPOSED / lights.exposure[light] * wp.vec3(1.0, 1.0, 1.0)

@@ -92,10 +92,7 @@ def make_noise_kernel(
     noise_out: wp.array3d[wp.uint32],  # (x, y, z)
 ):
     """Bake the noise table: three periodic sums of two octaves of Perlin noise, for rust, stains and ends of scratches, in the bits 31 to
-    21, 20 to 10 and 9 to 0; the second has cells twice as wide.
-
-    Launched over its samples.
-    """
+    21, 20 to 10 and 9 to 0; the second has cells twice as wide. Launched over its samples."""
     i, j, k = wp.tid()
     packed = wp.uint32(0)
     for channel in range(3):

@@ -170,9 +170,7 @@ def is_blocked(
     meshes: Meshes, table: Table, bodies: ViewBodies, view: int, tote: int, origin: wp.vec3, direction: wp.vec3, reach: float
 ) -> bool:
     """Any-hit query (shadow ray): True if something lies within `reach` [m] of `origin` along the unit vector `direction`, in the world.
-
-    `tote` is the row of the tote, whose BVH is skipped for rays in its empty interior; -1: without this test.
-    """
+    `tote` is the row of the tote, whose BVH is skipped for rays in its empty interior; -1: without this test."""
     if table.visible != 0 and direction[2] < 0.0:
         if origin[2] + reach * direction[2] < table.height:
             return True

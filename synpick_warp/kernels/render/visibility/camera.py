@@ -138,10 +138,8 @@ def lens_of(cameras: LensCameras, view: int) -> int:  # noqa: F811
 
 @wp.func
 def camera_ray(cameras: AnyCameras, view: int, row: int, column: int, offset: wp.vec2) -> wp.vec3:
-    """Camera ray (x, y, 1) of a pixel of a view in the camera's axes: its parameter is planar depth.
-
-    `offset` [px] from the pixel's centre; zero for depth, ids and masks. The ray of a lens is that of the nearest pixel in the image.
-    """
+    """Camera ray (x, y, 1) of a pixel of a view in the camera's axes: its parameter is planar depth. `offset` [px] from the pixel's centre;
+    zero for depth, ids and masks. The ray of a lens is that of the nearest pixel in the image."""
     return loop_ray(cameras, cameras.intrinsics[view], view, row, column, offset)
 
 
@@ -247,10 +245,8 @@ def compute_rays_kernel(
     # Out:
     ray_out: wp.array3d[wp.vec2],  # (view, row, column)
 ):
-    """Ray of each pixel of the views that have a lens, by Newton's method from that of the same pixel in the scene, `cameras`.
-
-    `slot` is the row of a view's camera in the scene. Launched over view, row, column.
-    """
+    """Ray of each pixel of the views that have a lens, by Newton's method from that of the same pixel in the scene, `cameras`. `slot` is
+    the row of a view's camera in the scene. Launched over view, row, column."""
     view, row, column = wp.tid()
     if view_cameras.lens[view] >= 0:
         center = wp.vec2(0.0, 0.0)

@@ -151,8 +151,7 @@ def is_kept(damage: Damage, kept: KeptMasks, view: int, body: int) -> bool:
 @wp.kernel
 def restore_masks_kernel(damage: Damage, kept: KeptMasks, threads: int, masks_inout: InstanceMasks):
     """Copy the masks of instances at rest from the previous frame, and clear all others. Launched over view, instance, thread: `threads`
-    threads stride over an instance's words, whose number the host does not know.
-    """
+    threads stride over an instance's words, whose number the host does not know."""
     view, instance, thread = wp.tid()
     rests = is_kept(damage, kept, view, instance)
     mask = read_mask(masks_inout, view, instance)

@@ -80,10 +80,8 @@ def write_sample(
     low_half: wp.uint64,
     mask: Mask,
 ):
-    """Depth test by atomic min where a pixel's ray hits a triangle, and atomic or of the pixel's bit in the instance's amodal mask.
-
-    `kept` is the view's row of the visibility buffer, `low_half` the lower half of the key.
-    """
+    """Depth test by atomic min where a pixel's ray hits a triangle, and atomic or of the pixel's bit in the instance's amodal mask. `kept`
+    is the view's row of the visibility buffer, `low_half` the lower half of the key."""
     weights = ray_weights(triangle, ray)
     if weights[0] >= 0.0:
         depth = triangle.near + wp.dot(weights, wp.vec3(triangle.a[2], triangle.b[2], triangle.c[2]))
@@ -112,10 +110,8 @@ def rasterize_footprint(
     low_half: wp.uint64,
     mask: Mask,
 ):
-    """Scanline loop: `write_sample` for the pixels of a footprint within its box.
-
-    Rows and columns share one loop, so that the threads of a warp stay together: their triangles differ in rows more than in pixels.
-    """
+    """Scanline loop: `write_sample` for the pixels of a footprint within its box. Rows and columns share one loop, so that the threads of a
+    warp stay together: their triangles differ in rows more than in pixels."""
     intrinsics = cameras.intrinsics[view]
     row = footprint.pixels[1] - 1
     column = int(0)
@@ -148,10 +144,8 @@ def list_blocks(visibility: VisibilityBuffer, view: int, rank: int, triangle: in
 
 @kernel_of_views
 def clear_visibility_kernel(grid: ImageGrid, damage: Damage, views: AnyViews, first: int, visibility_out: VisibilityBuffer):
-    """Reset the visibility keys of damaged tiles, and empty the work list; nothing is written for unused views (camera -1).
-
-    Launched over view, row of a tile (tile order, from flat index `first` on): with a thread a pixel, launching them would take most time.
-    """
+    """Reset the visibility keys of damaged tiles, and empty the work list; nothing is written for unused views (camera -1). Launched over
+    view, row of a tile (tile order, from flat index `first` on): with a thread a pixel, launching them would take most time."""
     view, row, column = tile_pixel(grid, (wp.tid() + first) * TILE_WIDTH)
     if not in_image(grid, row, column) or views.camera[view] < 0:
         return
@@ -226,11 +220,8 @@ def rasterize_blocks_kernel(
     visibility_inout: VisibilityBuffer,
     masks_inout: InstanceMasks,
 ):
-    """Rasterize the listed blocks of large triangles into visibility buffer and amodal masks.
-
-    Launched over view, thread (flat, from `first` on): the `threads` threads of a view stride over the rows of its blocks, whose number the
-    host does not know.
-    """
+    """Rasterize the listed blocks of large triangles into visibility buffer and amodal masks. Launched over view, thread (flat, from
+    `first` on): the `threads` threads of a view stride over the rows of its blocks, whose number the host does not know."""
     index = wp.tid() + first
     view = index // threads
     camera = views.camera[view]

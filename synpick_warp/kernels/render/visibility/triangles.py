@@ -89,10 +89,8 @@ def edge_areas(triangle: Triangle, ray: wp.vec3) -> wp.vec3:
 
 @wp.func
 def ray_weights(triangle: Triangle, ray: wp.vec3) -> wp.vec3:
-    """Watertight ray/triangle intersection (Woop, Benthin and Wald, 2013): barycentric weights of a, b, c, edges included; -1: a miss.
-
-    All rays start at the camera and have the optical axis as their dominant axis.
-    """
+    """Watertight ray/triangle intersection (Woop, Benthin and Wald, 2013): barycentric weights of a, b, c, edges included; -1: a miss. All
+    rays start at the camera and have the optical axis as their dominant axis."""
     areas = edge_areas(triangle, ray)
     total = areas[0] + areas[1] + areas[2]
     if (wp.min(areas) < 0.0 and wp.max(areas) > 0.0) or total == 0.0:
@@ -126,10 +124,8 @@ def is_out_of_sight(grid: ImageGrid, cameras: AnyCameras, intrinsics: wp.vec4, v
 
 @wp.func
 def find_footprint(grid: ImageGrid, cameras: AnyCameras, intrinsics: wp.vec4, view: int, triangle: Triangle) -> Footprint:
-    """Project a triangle and compute its conservative footprint, clipped to the image.
-
-    Lens distortion bends edges: they stay within BEND D² / 6 of straight ones (D: longest edge in the normalised plane), added as a margin.
-    """
+    """Project a triangle and compute its conservative footprint, clipped to the image. Lens distortion bends edges: they stay within BEND
+    D² / 6 of straight ones (D: longest edge in the normalised plane), added as a margin."""
     found = Footprint()
     found.pixels = wp.vec4i(0, 0, grid.width - 1, grid.height - 1)
     depth = wp.vec3(triangle.near + triangle.a[2], triangle.near + triangle.b[2], triangle.near + triangle.c[2])

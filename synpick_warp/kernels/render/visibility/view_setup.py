@@ -64,10 +64,8 @@ def set_up_views_kernel(
     # Out:
     bodies_out: ViewBodies,
 ):
-    """Transform each body into a view's camera, x_camera = R (x_world - c), in float64, stored in float32. Launched over view, body.
-
-    Fills `ViewBodies` except `order`, `ray_record`, `present` and `body_mask`. Absent bodies, and all bodies of unused views, get mesh -1.
-    """
+    """Transform each body into a view's camera, x_camera = R (x_world - c), in float64, stored in float32. Launched over view, body. Fills
+    `ViewBodies` except `order`, `ray_record`, `present` and `body_mask`. Absent bodies, and all bodies of unused views, get mesh -1."""
     view, body = wp.tid()
     world = views.world[view]
     mesh = int(-1)
@@ -121,9 +119,7 @@ def rank_depth(bodies: ViewBodies, view: int, body: int) -> float:
 @wp.kernel
 def sort_bodies_kernel(meshes: Meshes, bodies_inout: ViewBodies):
     """Sort the present bodies of each view front to back, the tote last, by counting: a body's rank is the number of bodies before it.
-
-    Writes `order`, `ray_record` and `present`. Launched over view, body.
-    """
+    Writes `order`, `ray_record` and `present`. Launched over view, body."""
     view, body = wp.tid()
     bodies = bodies_inout.mesh.shape[1]
     near = rank_depth(bodies_inout, view, body)

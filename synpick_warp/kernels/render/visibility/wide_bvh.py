@@ -146,11 +146,8 @@ _TRAVERSAL = (
 """
 )
 def query_closest_hit(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec3, reach: float) -> wp.vec4:
-    """Closest-hit query of a ray against one mesh, given by its root node.
-
-    Returns (t, u, v, i): distance in units of |direction|, 0 <= t < `reach`, or -1 if there is no hit; barycentric weights of the first and
-    second corner; triangle index within the mesh, as bits.
-    """
+    """Closest-hit query of a ray against one mesh, given by its root node. Returns (t, u, v, i): distance in units of |direction|, 0 <= t <
+    `reach`, or -1 if there is no hit; barycentric weights of the first and second corner; triangle index within the mesh, as bits."""
     ...
 
 

@@ -82,10 +82,8 @@ def make_context(scene: AnyScene, coarse: CoarseGrid, rules: PathRules, shot: An
 def average_paths(
     scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, samples: int, first: Vertex, width: float, pixel: PathPixel
 ) -> SplitRadiance:
-    """Monte Carlo mean of the reflected light over `samples` paths of a coarse pixel, each limited by the firefly clamp (`clamp_path`).
-
-    The paths start at the vertex `first`; `width` is their footprint there [m].
-    """
+    """Monte Carlo mean of the reflected light over `samples` paths of a coarse pixel, each limited by the firefly clamp (`clamp_path`). The
+    paths start at the vertex `first`; `width` is their footprint there [m]."""
     sum = SplitRadiance()
     lamplit = lamplit_radiance(scene.lights, context.light)
     # One loop over all bounces of all paths: a thread whose path ends early starts the next while others of its warp go on.
@@ -170,10 +168,8 @@ def finish_path(
     pixel: PathPixel,
     radiance: SplitRadiance,
 ):
-    """Finish a coarse pixel whose single path has terminated: firefly clamp of its `radiance`, then `finish_pixel`.
-
-    Parameters that are not named here are those of `finish_pixel`.
-    """
+    """Finish a coarse pixel whose single path has terminated: firefly clamp of its `radiance`, then `finish_pixel`. Parameters that are not
+    named here are those of `finish_pixel`."""
     lamplit = lamplit_radiance(scene.lights, context.light)
     light = clamp_path(radiance, pixel.unoccluded, lamplit, pixel.specular_limit, rules.firefly_clamp)
     finish_pixel(out, history, scene.lights.exposure[context.light], cell, slot, row, column, pixel, light, 1)
@@ -184,13 +180,8 @@ def make_path_pixel(
     scene: AnyScene, rules: PathRules, context: PathContext, vertex: Vertex, index: int, segment: int, known: int, number: int
 ) -> PathPixel:
     """Data with which the light of a coarse pixel's paths is combined: unoccluded light, diffuse colour, firefly limit, history length.
-
-    Args:
-        vertex: The surface that the coarse pixel shows, with segmentation id `segment`.
-        index: Index of the coarse pixel in interleaved order.
-        known: Number of valid paths of its history.
-        number: Sobol' index of its first path, by `first_path_index`.
-    """
+    `vertex`: the surface that the coarse pixel shows, with segmentation id `segment`. `index`: index of the coarse pixel in interleaved
+    order. `known`: number of valid paths of its history. `number`: Sobol' index of its first path, by `first_path_index`."""
     lamplit = lamplit_radiance(scene.lights, context.light)
     pixel = PathPixel()
     pixel.offset = index % REGION_PIXELS
@@ -217,10 +208,8 @@ def trace_pixel(
     coarse_light_out: CoarseLight,
     queued: bool,
 ):
-    """Trace the paths of a thread's coarse pixel, if this kernel is responsible: writes guide image and light, or queues the path.
-
-    With `queued` (a constant, so that the compiler removes the other case) it is for pixels with one path; else for others.
-    """
+    """Trace the paths of a thread's coarse pixel, if this kernel is responsible: writes guide image and light, or queues the path. With
+    `queued` (a constant, so that the compiler removes the other case) it is for pixels with one path; else for others."""
     regions = queues.count.shape[1]
     index = thread
     known, bits = int(0), int(0)

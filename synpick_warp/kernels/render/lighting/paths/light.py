@@ -41,11 +41,8 @@ def clamp_light(light: wp.vec3, limit: float) -> wp.vec3:
 def clamp_path(
     radiance: SplitRadiance, unoccluded: SplitRadiance, lamplit: wp.vec3, specular_limit: float, firefly_clamp: float
 ) -> SplitRadiance:
-    """Firefly clamp: a path counts with at most `firefly_clamp` times the unoccluded light.
-
-    The limit of indirect light is higher by `lamplit` (see `lamplit_radiance`), since the unoccluded light excludes the lamps.
-    `specular_limit` is that of `limit_specular`.
-    """
+    """Firefly clamp: a path counts with at most `firefly_clamp` times the unoccluded light. The limit of indirect light is higher by
+    `lamplit` (see `lamplit_radiance`), since the unoccluded light excludes the lamps. `specular_limit` is that of `limit_specular`."""
     result = SplitRadiance()
     result.diffuse = clamp_light(radiance.diffuse, wp.max(firefly_clamp * unoccluded.diffuse))
     result.indirect = clamp_light(radiance.indirect, wp.max(firefly_clamp * unoccluded.diffuse + lamplit))
@@ -80,10 +77,8 @@ def unpack_half2(packed: float) -> wp.vec2:
 
 @wp.func
 def pack_light(light: wp.vec3, unoccluded: wp.vec3, statistic: float) -> wp.vec4:
-    """Pack occluded and unoccluded light in half precision, and a `statistic` of the luminance of their visibility ratio.
-
-    For single coarse pixels the statistic is the ratio itself, for blocks the variance of the mean ratio.
-    """
+    """Pack occluded and unoccluded light in half precision, and a `statistic` of the luminance of their visibility ratio. For single coarse
+    pixels the statistic is the ratio itself, for blocks the variance of the mean ratio."""
     return wp.vec4(pack_half2(light[0], light[1]), pack_half2(light[2], unoccluded[0]), pack_half2(unoccluded[1], unoccluded[2]), statistic)
 
 

@@ -79,10 +79,8 @@ def reuse_histories_kernel(
     guide_out: Guide,
     coarse_light_out: CoarseLight,
 ):
-    """Temporal reuse: coarse pixels that trace no path in this frame get the light of their history, in tiles of LIGHT_STAGE.
-
-    Launched over view, coarse pixel (tile order, from flat index `first` on).
-    """
+    """Temporal reuse: coarse pixels that trace no path in this frame get the light of their history, in tiles of LIGHT_STAGE. Launched over
+    view, coarse pixel (tile order, from flat index `first` on)."""
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if skips(coarse.grid, flags, LIGHT_STAGE, view, row, column) or lists.listed[view, row, column] != wp.uint8(0):
         return

@@ -307,9 +307,7 @@ def extend_path(
     scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, index: int, first_diffuse: wp.vec3, path: Path, vertex: Vertex
 ) -> Path:
     """Scatter path `index` once at its last `vertex`: add the direct light there, then move the path to the next hit or terminate it.
-
-    `first_diffuse` is the diffuse colour of the path's first surface, which multiplies all its diffuse light in the end.
-    """
+    `first_diffuse` is the diffuse colour of the path's first surface, which multiplies all its diffuse light in the end."""
     bounce = path.bounce
     light = context.light
     if bounce == 0:
