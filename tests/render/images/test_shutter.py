@@ -7,6 +7,7 @@ import pytest
 
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.scenes.types import Glass
 from synpick_warp.stages.buffers import allocate_view_buffers
 from synpick_warp.stages.render.cameras import allocate_view_cameras, place_cameras
 from synpick_warp.stages.render.shutter import plan_sub_frames
@@ -16,6 +17,7 @@ from tests.worlds.toy_scene import ToyScene, build_scene, snapshot, views_of, wi
 TICK = Config().physics.tick_time
 WIDTH, HEIGHT, FOCAL, TOP = 64, 24, 64.0, 1.0
 VIEW = camera(WIDTH, HEIGHT, FOCAL, (0.0, 0.0, TOP))
+BENT = distorted(VIEW, -0.1, 0.05, 0.0, 0.0)
 SPEED = 16.0
 """Motion in a frame [px], at `TOP` below the camera."""
 STEP = SPEED * TOP / FOCAL
@@ -101,22 +103,26 @@ def test_weights_of_each_row_sum_to_one():
         )
 
 
-def test_pictures_of_moving_cameras_are_blurred_whole(device):
+@pytest.mark.parametrize("view", [VIEW, BENT])
+def test_pictures_of_moving_cameras_are_blurred_whole(device, view):
     """A camera's step to the right moves the picture to the left."""
-    _, moved = expose(scene(), device, (0.5, 0.0), carried=np.array([STEP, 0.0, 0.0]), step=(0.0, 0.0, 0.0))
-    _, other = expose(scene(), device, (0.5, 0.0), step=(-STEP, 0.0, 0.0))
+    toy = scene(view=view)
+    _, moved = expose(toy, device, (0.5, 0.0), carried=np.array([STEP, 0.0, 0.0]), step=(0.0, 0.0, 0.0))
+    _, other = expose(toy, device, (0.5, 0.0), step=(-STEP, 0.0, 0.0))
     np.testing.assert_allclose(moved, other, atol=1e-3)
-    _, none = expose(scene(), device, (0.5, 0.0), carried=np.array([STEP, 0.0, 0.0]), step=(STEP, 0.0, 0.0))
-    _, sharp = expose(scene(), device, (0.0, 0.0), carried=np.array([STEP, 0.0, 0.0]))
+    _, none = expose(toy, device, (0.5, 0.0), carried=np.array([STEP, 0.0, 0.0]), step=(STEP, 0.0, 0.0))
+    _, sharp = expose(toy, device, (0.0, 0.0), carried=np.array([STEP, 0.0, 0.0]))
     np.testing.assert_allclose(none[:, :, : WIDTH - 4], sharp[:, :, : WIDTH - 4], atol=1e-3)
 
 
 @pytest.mark.parametrize("mode", [FAST, UNOCCLUDED, REFERENCE])
-@pytest.mark.parametrize("bent", [False, True])
-def test_views_in_which_nothing_moves_have_the_bytes_of_an_instant(device, mode, bent):
+@pytest.mark.parametrize("kind", ["plain", "bent", "glass"])
+def test_views_in_which_nothing_moves_have_the_bytes_of_an_instant(device, mode, kind):
     """Others of the batch do not change them, and the truth stays."""
-    view = distorted(VIEW, -0.1, 0.05, 0.0, 0.0) if bent else VIEW
-    toy = scene(mode, 3, view, 2, history=8)
+    toy = scene(mode, 3, BENT if kind == "bent" else VIEW, 2, history=8)
+    if kind == "glass":
+        pane = replace(surface(roughness=0.1), glass=Glass(0.8, 1.5, 0.0))
+        toy = replace(toy, entries=[entry(sheet(3.0, 2.0), pane), *toy.entries[1:]])
     given = {"histories": 3, "frames": 2}
     plain, _ = expose(toy, device, (0.0, 0.0), worlds=(1,), **given)
     blurred, _ = expose(toy, device, (0.5, 0.2), worlds=(1,), **given)
