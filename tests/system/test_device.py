@@ -23,6 +23,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DeviceError
 from synpick_warp.factory import assembly, warmup
 from synpick_warp.factory.assembly import launch_all, make_compiler
+from synpick_warp.kernels.rng import uniform
 from synpick_warp.newton_patches.narrow_phase import SHIPPED, slow_builds
 from synpick_warp.system.hardware import device as hardware
 from synpick_warp.system.hardware import kernels
@@ -217,6 +218,18 @@ def test_kernels_of_a_library_get_modules_of_their_own(device, empty_cache):
     np.testing.assert_array_equal(values.numpy(), 6.0)
     assert {kernel.module.name for kernel in (doubling, tripling)} == {"tests.library.double", "tests.library.triple"}
     assert len(kernels.list_binaries()) == 3
+
+
+def test_warp_finds_what_modules_of_others_use_alone():
+    """It unloads them with what they use, if that is imported anew."""
+
+    def draw(values: wp.array[float]):
+        values[wp.tid()] = uniform(wp.uint64(1), 0)
+
+    others, ours = (wp.Module(name, None) for name in ("theirs", "synpick_warp.kernels.drawing"))
+    for module in (others, ours):
+        wp.Kernel(draw, key="draw", module=module)
+    assert (others.references, ours.references) == ({uniform.module}, set())
 
 
 HOLDER = """

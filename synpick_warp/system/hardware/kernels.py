@@ -237,6 +237,16 @@ def make_build(module: wp.Module, device: Any, block: int | None) -> ModuleBuild
     return ModuleBuild(module, wp.get_device(device).alias, module.options["block_dim"] if block is None else block)
 
 
+def _find_references(module: wp.Module, adjoint: Any, find: Callable[..., None] = wp.Module._find_references) -> None:
+    """Find the modules that a function uses, which Warp unloads with a module that is imported anew. No program imports Newton's or ours
+    anew, and for their 2,900 functions the search takes a fifth of the CPU time of their imports."""
+    if not module.name.startswith(("newton.", f"{__name__.partition('.')[0]}.")):
+        find(module, adjoint)
+
+
+wp.Module._find_references = _find_references  # type: ignore[method-assign]
+
+
 @contextlib.contextmanager
 def dry_launches() -> Iterator[dict[ModuleBuild, None]]:
     """Dry run of kernel launches, by replacing `wp.Module.load`: in all threads kernels neither load nor run; copies and fills do run. The
