@@ -6,12 +6,13 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 
 import msgspec
 import pytest
 
 import synpick_warp
-from synpick_warp.cloud import claims, run
+from synpick_warp.cloud import claims, run, workers
 from synpick_warp.cloud.claims import Chunk, Chunks, Claims, LeaseLostError, Sizes, default_chunk
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.run import Crew, Job, PlanProgress
@@ -238,7 +239,7 @@ def test_a_killed_worker_leaves_the_set_of_one_bake(prefix, tmp_path):
 
 
 @pytest.mark.slow
-def test_workers_of_several_devices_share_a_set(prefix, tmp_path):
+def test_workers_of_several_devices_share_a_set(prefix, tmp_path, monkeypatch):
     """Each device has one process for all of its chunks; the settings in the store are those of the command."""
     job = Job(tiny(), prefix, bake=scripted_bake.bake_episodes, lease=60.0)
     crew = Crew(price=3600.0)
@@ -246,6 +247,7 @@ def test_workers_of_several_devices_share_a_set(prefix, tmp_path):
     assert (summary.total, summary.stopped, crew.alive) == (EPISODES, 0, 2)
     scripted_bake.bake(tmp_path / "local", tiny().with_values({"bake.device": "cpu"}))
     assert stored(prefix) == files(tmp_path / "local")
+    monkeypatch.setattr(workers, "DeviceProcesses", lambda *_: nullcontext())
     assert bake_with_devices(job, ("cpu",), SilentProgress(), crew).total == 0
 
 

@@ -68,11 +68,14 @@ def computed() -> dict[str, str]:
     return found
 
 
+def fingerprints(folder: Path) -> dict[str, str]:
+    """Fingerprints of what is computed, and of the files of a bake into a folder."""
+    given = PICKED | ONE_EPISODE | {"cameras.resolution": [48, 27], "bop.keypoints": 4, "bake.formats": FORMATS}
+    bake_boxes(folder, given)
+    return computed() | digests(folder)
+
+
 if __name__ == "__main__":
     start_warp()
     with made_once(), written_here():
-        bake_boxes(
-            Path(sys.argv[1]),
-            PICKED | ONE_EPISODE | {"cameras.resolution": [48, 27], "bop.keypoints": 4, "bake.formats": FORMATS},
-        )
-    print(json.dumps(computed() | digests(Path(sys.argv[1]))))
+        print(json.dumps(fingerprints(Path(sys.argv[1]))))

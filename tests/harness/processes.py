@@ -27,11 +27,11 @@ def children(process: int) -> list[int]:
     return [int(pid) for pid in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
 
 
-def kill_after(process: int, seconds: float, writer: bool) -> None:
-    """Kill a bake's process after a delay [s]; with `writer` its last child process, if any. Returns early if the bake ends."""
-    end = time.monotonic() + seconds
+def kill_at(process: int, folder: Path, files: int, writer: bool) -> None:
+    """Kill a bake's process once its folder has a number of files; with `writer` its last child process, if any. Returns early if the bake
+    ends."""
     with contextlib.suppress(ProcessLookupError, FileNotFoundError):
-        while time.monotonic() < end:
+        while sum(len(names) for *_, names in os.walk(folder)) < files:
             os.kill(process, 0)
             time.sleep(0.01)
         os.kill(([process, *children(process)] if writer else [process])[-1], signal.SIGKILL)
