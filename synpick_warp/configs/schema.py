@@ -346,8 +346,8 @@ class Config:
 
     def with_values(self, values: Mapping[str, object]) -> "Config":
         """Copy with other values of settings, by full key. They are not validated; see `load.override_config`."""
-        parts: dict[str, Any] = {}
+        parts: dict[str, dict[str, Any]] = {}
         for key, value in values.items():
             section, _, name = key.partition(".")
-            parts[section] = replace(parts.get(section, getattr(self, section)), **{name: value})
-        return replace(self, **parts)
+            parts.setdefault(section, {})[name] = value
+        return replace(self, **{section: replace(getattr(self, section), **content) for section, content in parts.items()})

@@ -91,10 +91,8 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
         section, _, name = key.partition(".")
         if section == SPLITS or (config.splits and key in _OF_SPLITS):
             raise ConfigError(f"{key} is set {source}, but the configuration has its splits already; pass it to load_config")
-        found = _section_values(section, {name: value}, source)
-        values |= found
-        config = config.with_values({name: pair[0] for name, pair in found.items()})
-    config = _follow(config, values)
+        values |= _section_values(section, {name: value}, source)
+    config = _follow(config.with_values({key: value for key, (value, _) in values.items()}), values)
     _check_conflicts(config, values)
     return config
 
