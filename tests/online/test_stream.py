@@ -20,6 +20,7 @@ from synpick_warp.online import stream as online
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.views.layer_codec import decode_layer, encode_layer
+from tests.builders import COARSE
 from tests.harness.environment import checkout_environment
 from tests.online.conftest import LAYERED, tiny
 from tests.worlds.cells import CELL, make_camera
@@ -287,7 +288,7 @@ def test_a_script_needs_no_main_guard(tmp_path):
     """It leaves the loop early, and the process ends by itself, without children."""
     script = tmp_path / "train.py"
     script.write_text(
-        SCRIPT.format(settings=QUICK | {"bake.device": "cpu"})
+        SCRIPT.format(settings=QUICK | COARSE | {"bake.device": "cpu"})
         + "import os\nos.execvp('ps', ['ps', '--ppid', str(os.getpid()), '--no-headers'])"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, cwd=tmp_path, env=checkout_environment(), timeout=300)
