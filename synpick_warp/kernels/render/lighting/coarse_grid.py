@@ -83,13 +83,19 @@ def pack_normal(normal: wp.vec3) -> int:
 
 
 @wp.func
-def unpack_normal(packed: int) -> wp.vec3:
-    """Unit vector that `pack_normal` rounded, up to 8° from the normal."""
+def octahedral_vector(packed: int) -> wp.vec3:
+    """Vector of some length in the direction that `pack_normal` rounded, up to 8° from the normal."""
     p = 2.0 * float((packed >> 4) & 15) / float(NORMAL_STEPS) - 1.0
     q = 2.0 * float(packed & 15) / float(NORMAL_STEPS) - 1.0
     x = 0.5 * (p + q)
     y = 0.5 * (p - q)
-    return wp.normalize(wp.vec3(x, y, wp.abs(x) + wp.abs(y) - 1.0))
+    return wp.vec3(x, y, wp.abs(x) + wp.abs(y) - 1.0)
+
+
+@wp.func
+def unpack_normal(packed: int) -> wp.vec3:
+    """Unit vector of `octahedral_vector`."""
+    return wp.normalize(octahedral_vector(packed))
 
 
 @wp.func

@@ -8,11 +8,11 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     CoarseGrid,
     coarse_coordinate,
     middle_pixel,
+    octahedral_vector,
     pack_normal,
     surface_depth,
     surface_normal,
     surface_segment,
-    unpack_normal,
 )
 from synpick_warp.kernels.render.lighting.color import half3_tag, pack_half3, tag_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance
@@ -98,8 +98,9 @@ def upsampling_weight(record: RatioRecord, coarse: CoarseGrid, plane: Plane, row
     if segment != plane.segment:
         return MIN_WEIGHT
     relative = distance / (PLANE_WIDTH * float(coarse.size) * plane.width)
-    cosine = wp.dot(unpack_normal(int(half3_tag(record[2]) >> wp.uint32(8))), plane.normal)
-    falloff = cosine * cosine / (1.0 + relative * relative)
+    vector = octahedral_vector(int(half3_tag(record[2]) >> wp.uint32(8)))
+    cosine = wp.dot(vector, plane.normal)
+    falloff = cosine * cosine / (wp.dot(vector, vector) * (1.0 + relative * relative))
     return wp.max(falloff * falloff, MIN_WEIGHT)
 
 
