@@ -18,7 +18,7 @@ from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import ConfigError, DatasetError, format_value, suggest
-from synpick_warp.system.linear_algebra import is_orthonormal
+from synpick_warp.system.linear_algebra import det, is_orthonormal
 from synpick_warp.views.layer_codec import decode_layer, image_format
 
 if TYPE_CHECKING:
@@ -124,7 +124,10 @@ class View:
     @cached_property
     def intrinsics(self) -> CameraMatrix:
         """Camera matrix K (3, 3) float64 [px]; `intrinsics("opencv")` is the one for OpenCV and Open3D."""
-        return np.reshape(np.asarray(self._camera_value("cam_K"), np.float64), (3, 3)).view(CameraMatrix)
+        matrix = np.reshape(np.asarray(self._camera_value("cam_K"), np.float64), (3, 3)).view(CameraMatrix)
+        if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
+            raise DatasetError(f"{self._files.place}: the camera of image {self.image_id} has no focal length above 0; {ADVICE}")
+        return matrix
 
     @cached_property
     def lens(self) -> LensMap | None:
@@ -144,7 +147,7 @@ class View:
         if not {"cam_R_w2c", "cam_t_w2c"} <= camera.keys():
             raise DatasetError(f"{place} has no cam_R_w2c and cam_t_w2c; {ADVICE}")
         transform = make_transform(camera["cam_R_w2c"], camera["cam_t_w2c"])
-        if not is_orthonormal(transform[:3, :3]):
+        if not (is_orthonormal(transform[:3, :3]) and det(transform[:3, :3]) > 0):
             raise DatasetError(f"{place} has a cam_R_w2c that is no rotation; {ADVICE}")
         return transform
 

@@ -137,6 +137,8 @@ def test_an_image_that_does_not_fit_its_camera_is_named(tmp_path, name, content,
         ("camera", (0, "cam_K"), [1.0] * 8, r"scene_camera\.json is damaged: expected array of length >= 9 - at \$\[\.\.\.\]\.cam_K"),
         ("camera", (0, "depth_scale"), "0.1", r"expected float, got str"),
         ("camera", (0, "cam_R_w2c"), [0.0] * 9, r"the camera of image 0 has a cam_R_w2c that is no rotation"),
+        ("camera", (0, "cam_R_w2c"), [1, 0, 0, 0, 1, 0, 0, 0, -1], r"the camera of image 0 has a cam_R_w2c that is no rotation"),
+        ("camera", (0, "cam_K"), [0.0] * 9, r"the camera of image 0 has no focal length above 0"),
         ("gt", (0, 0, "cam_t_m2c"), [0.0, 0.0, 10**30], r"expected float <= 1000000000"),
         ("gt", (0, 0), 3, r"expected object, got int"),
         ("gt", (0, 0, "obj_id"), -1, r"expected int >= 0"),
@@ -158,7 +160,7 @@ def test_a_wrong_annotation_is_named_with_file_and_place(tmp_path, name, place, 
     path.write_text(json.dumps(replaced(json.loads(path.read_text()), (str(place[0]), *place[1:]), value)))
     view = data[0].view(0)
     with pytest.raises(DatasetError, match=said) as caught:
-        _ = view.boxes, view.object_to_world
+        _ = view.boxes, view.object_to_world, view.intrinsics
     assert str(caught.value).isprintable()
 
 
