@@ -113,6 +113,33 @@ def test_a_killed_run_goes_on_where_it_was(picked_set, tmp_path, monkeypatch):
     assert len(list(tmp_path.glob(".twins-*"))) == 1
 
 
+def test_what_changed_after_an_interruption_is_made_anew(picked_set, tmp_path, monkeypatch):
+    """Corrected poses hold for all twins; of a damaged record the lines before the damage count."""
+    scene = small_set(picked_set, tmp_path / "real")
+    real, settings = tmp_path / "real", synpick_warp.load_config(None, {"bake.device": "cpu", "render.table": False})
+    monkeypatch.setattr(twins, "BATCH_PIXELS", 1)
+    counts = []
+
+    def kill(label: str, done: int, count: int) -> None:
+        counts.append(done)
+        if done == 3:
+            raise KeyboardInterrupt
+
+    def write(*given) -> list[twins.Likeness]:
+        return write_twins(synpick_warp.open(real), tmp_path / "twins", settings, *given, note=lambda text: None)
+
+    with pytest.raises(KeyboardInterrupt):
+        write(kill)
+    (part,) = tmp_path.glob(".twins-*")
+    line, _, rest = (part / RECORD).read_bytes().partition(b"\n")
+    (part / RECORD).write_bytes(line + b"\n\0\0\n" + rest)
+    with pytest.raises(KeyboardInterrupt):
+        write(kill)
+    assert counts == [1, 2, 3, 2, 3]
+    (scene / "scene_gt.json").write_text(re.sub(r'("cam_t_m2c": ?\[)[^]]*', r"\g<1>0, 0, -500", (scene / "scene_gt.json").read_text()))
+    assert {one.score for one in write()} == {0.0}
+
+
 def test_images_keep_their_channels_and_bits(picked_set, tmp_path):
     """The first image with 16 bits, the second with opacity: objects have the twin's 8 bits, all else stays."""
     scene = small_set(picked_set, tmp_path / "real")
@@ -143,6 +170,9 @@ def test_what_has_no_twins_is_one_line(picked_set, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     assert "allowed: a new or an empty folder" in mistake("gap", picked_set, "--out", tmp_path / "full")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Path, "is_mount", lambda path: path.name == "new")
+        assert "new, a mount point" in mistake("gap", picked_set, "--out", tmp_path / "new")
     assert "is not a data set" in mistake("gap", tmp_path / "full", "--out", tmp_path / "new")
     scene = small_set(picked_set, tmp_path / "real")
     truth = (scene / "scene_gt.json").read_text()

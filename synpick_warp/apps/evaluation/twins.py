@@ -8,7 +8,8 @@ therefore the appearance gap; what it lacks on twins has other causes. Without a
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +29,7 @@ from synpick_warp.dataset.commit.writing import lock_folder
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.dataset.view_files import SceneFolder
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.online.render import SceneRenderer
 from synpick_warp.scenes.types import Camera
@@ -122,24 +123,30 @@ def write_twins(
 ) -> list[Likeness]:
     """Write the twins of all views of a data set, or of one split, in BOP's folders to the new folder `out`, with all else but other splits
     as links or copies, and RECORD. Returns the likeness of the objects of all views. What an interrupted run has written stays in a hidden
-    folder beside `out`; the next one with the same data and settings goes on there. `note` receives what is assumed. Raises SynpickError:
+    folder beside `out`; the next one with the same files and settings goes on there. `note` receives what is assumed. Raises SynpickError:
     there are no objects, files are missing or damaged, or a setting cannot be used; headers and annotations are read before any work."""
     out, root, note = out.resolve(), data_set.folder, cache(note)
+    if out.is_mount():
+        raise OutputError(f"--out is {out}, a mount point, which cannot be renamed to; name a folder in it")
     splits, names, wanted, camera = _check_inputs(data_set, note)
     models = find_models(root, wanted, "twins are rendered")
     files = {index: path for index, (path, _) in models.items()}
     tolerances = {index: None if info.diameter is None else DEPTH_TOLERANCE * info.diameter for index, (_, info) in models.items()}
     renderer = SceneRenderer(list(files.values()), [camera], (), UNIT, settings.bake.device, settings)
-    states = [(path, path.stat().st_size, path.stat().st_mtime_ns) for path in files.values()]
-    content = repr((__version__, root.resolve(), names, states, config_to_toml(settings)))
-    work = out.with_name(f".{out.name}-{hashlib.sha256(content.encode()).hexdigest()[:_DIGITS]}")
-    with output_errors(out):
+    with output_errors(out), ExitStack() as stack:
+        paths = _list_files(root, splits)
+        states = [(path, state.st_size, state.st_mtime_ns) for path in paths for state in [path.lstat()]]
+        content = repr((__version__, root.resolve(), names, states, config_to_toml(settings)))
+        work = out.with_name(f".{out.name}-{hashlib.sha256(content.encode()).hexdigest()[:_DIGITS]}")
         make_folder(work)
-        lock, made = lock_folder(work), dict[str, list[Likeness]]()
+        stack.callback(os.close, lock_folder(work))
+        made = _read_record(work / RECORD)
         try:
-            made |= _read_record(work / RECORD)
-            _link_files(root, work, splits, made.keys() | {RECORD})
-            shots = (_make_shot(view, files) for view in _views(data_set) if names.get(_key(view), RECORD) not in made and len(view))
+            for path in paths:
+                if (name := str(path.relative_to(root))) not in made:
+                    (work / name).unlink(missing_ok=True)
+                    link_file(path, work / name)
+            shots = (_make_shot(view, files) for view in _views(data_set) if len(view) and names[_key(view)] not in made)
             with (work / RECORD).open("ab", buffering=0) as record:
                 for twin in render_twins(shots, renderer):
                     name = names[_key(twin.shot.source)]
@@ -148,7 +155,6 @@ def write_twins(
                     record.write(msgspec.json.encode(ImageRecord(name, found)) + b"\n")
                     made[name] = found
                     report("views", len(made), len(names))
-            work.chmod(root.stat().st_mode)
             work.rename(out)
         except BaseException:
             if made:
@@ -156,8 +162,6 @@ def write_twins(
             else:
                 shutil.rmtree(work, ignore_errors=True)
             raise
-        finally:
-            os.close(lock)
     return [one for objects in made.values() for one in objects]
 
 
@@ -203,21 +207,23 @@ def _has_depth(view: View) -> bool:
 
 
 def _read_record(path: Path) -> dict[str, list[Likeness]]:
-    """Likeness of the objects of each image that an earlier run has finished; a line that it has not is cut off."""
-    lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
-    path.write_bytes(b"".join(line + b"\n" for line in lines))
-    records = [msgspec.json.decode(line, type=ImageRecord) for line in lines]
-    return {record.image: record.objects for record in records}
+    """Likeness of the objects of each image that an earlier run has finished; lines from the first that is damaged on are cut off."""
+    made, size = dict[str, list[Likeness]](), 0
+    if path.exists():
+        with suppress(msgspec.MsgspecError):
+            for line in path.read_bytes().split(b"\n")[:-1]:
+                record = msgspec.json.decode(line, type=ImageRecord)
+                made[record.image] = record.objects
+                size += len(line) + 1
+        os.truncate(path, size)
+    return made
 
 
-def _link_files(root: Path, work: Path, splits: set[Path], others: Collection[str]) -> None:
-    """Link all files of a data set but those of other splits, and some `others`, into a folder."""
+def _list_files(root: Path, splits: set[Path]) -> list[Path]:
+    """All files of a data set but RECORD and those of other splits."""
     absent = {path.parent.parent for path in root.glob("*/*/scene_*.json")} - splits
-    for path in sorted(root.rglob("*")):
-        name = str(path.relative_to(root))
-        if name not in others and absent.isdisjoint(path.parents) and (path.is_symlink() or not path.is_dir()):
-            (work / name).unlink(missing_ok=True)
-            link_file(path, work / name)
+    files = (path for path in sorted(root.rglob("*")) if path.is_symlink() or not path.is_dir())
+    return [path for path in files if path != root / RECORD and absent.isdisjoint(path.parents)]
 
 
 def _place(view: View) -> tuple[Camera, np.ndarray]:
