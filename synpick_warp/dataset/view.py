@@ -18,7 +18,7 @@ from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import ConfigError, DatasetError, format_value, suggest
-from synpick_warp.system.linear_algebra import det, is_orthonormal
+from synpick_warp.system.linear_algebra import is_rotation
 from synpick_warp.views.layer_codec import decode_layer, image_format
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ class View:
         if not {"cam_R_w2c", "cam_t_w2c"} <= camera.keys():
             raise DatasetError(f"{place} has no cam_R_w2c and cam_t_w2c; {ADVICE}")
         transform = make_transform(camera["cam_R_w2c"], camera["cam_t_w2c"])
-        if not (is_orthonormal(transform[:3, :3]) and det(transform[:3, :3]) > 0):
+        if not is_rotation(transform[:3, :3]):
             raise DatasetError(f"{place} has a cam_R_w2c that is no rotation; {ADVICE}")
         return transform
 

@@ -44,9 +44,9 @@ def cofactors(matrix: np.ndarray) -> np.ndarray:
     return np.stack([np.cross(matrix[..., row - 2, :], matrix[..., row - 1, :]) for row in range(3)], axis=-2)
 
 
-def is_orthonormal(matrix: np.ndarray) -> bool:
-    """Whether the rows of a matrix (3, 3) are unit vectors perpendicular to each other, up to ORTHONORMAL."""
-    return np.allclose(matmul(matrix, matrix.T), np.eye(3), rtol=0.0, atol=ORTHONORMAL)
+def is_rotation(matrix: np.ndarray) -> bool:
+    """Whether a matrix (3, 3) is a rotation: its rows are unit vectors perpendicular to each other, up to ORTHONORMAL, and right-handed."""
+    return np.allclose(matmul(matrix, matrix.T), np.eye(3), rtol=0.0, atol=ORTHONORMAL) and bool(det(matrix) > 0.0)
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:

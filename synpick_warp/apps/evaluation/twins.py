@@ -35,7 +35,7 @@ from synpick_warp.online.render import SceneRenderer
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.inputs.files import make_folder
 from synpick_warp.system.inputs.image_files import decode_picture
-from synpick_warp.system.linear_algebra import det, is_orthonormal
+from synpick_warp.system.linear_algebra import is_rotation
 from synpick_warp.system.progress import Report, ignore_progress
 
 UNIT = 1e-3
@@ -228,7 +228,7 @@ def _list_files(root: Path, splits: set[Path]) -> list[Path]:
 
 def _place(view: View) -> tuple[Camera, np.ndarray]:
     """Camera of a view, and object to world (N, 4, 4) [m]."""
-    if not all(is_orthonormal(pose) and det(pose) > 0 for pose in view.object_to_camera[:, :3, :3]):
+    if not all(map(is_rotation, view.object_to_camera[:, :3, :3])):
         raise DatasetError(f"{view.place}: an object of image {view.image_id} has a cam_R_m2c that is no rotation")
     placed = view.world_to_camera if _ROTATION in view.records.camera else UPRIGHT
     camera = Camera(*view.size, np.asarray(view.intrinsics), placed[:3, :3], placed[:3, 3], lens=view.lens)

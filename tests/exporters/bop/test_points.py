@@ -113,6 +113,7 @@ def test_a_turned_photograph_keeps_the_pixels_of_its_file(tmp_path):
         ({"depth_scale": None}, "has no depth_scale"),
         ({"cam_K": [0.0] * 9}, "has a cam_K without focal lengths above 0"),
         ({"cam_R_w2c": [0.0] * 9, "cam_t_w2c": [0.0] * 3}, "has a cam_R_w2c that is no rotation"),
+        ({"cam_R_w2c": [1, 0, 0, 0, 1, 0, 0, 0, -1], "cam_t_w2c": [0.0] * 3}, "has a cam_R_w2c that is no rotation"),
         ({"cam_dist": ["much"]}, "the camera of image 4 of scene 2 has a cam_dist"),
         ({"depth": DEPTH[:, :2]}, "the depth of image 4 of scene 2 cannot be decoded, or is not of its camera's size"),
         ({"file": b"not a picture"}, "the colour of image 4 of scene 2 cannot be decoded"),

@@ -16,7 +16,7 @@ from synpick_warp.errors import ConfigError, DatasetError, OutputError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.view import MILLIMETERS, ViewSettings
 from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder, write_synced
-from synpick_warp.system.linear_algebra import is_orthonormal
+from synpick_warp.system.linear_algebra import is_rotation
 
 FOLDER = Path("points")
 """Folder in the data set."""
@@ -88,7 +88,7 @@ def _read_camera(camera: Mapping[str, Any], size: tuple[int, int], name: str) ->
     if "cam_R_w2c" not in camera or "cam_t_w2c" not in camera:
         return lens, None, np.eye(3)
     rotation = np.reshape(np.array(camera["cam_R_w2c"], float), (3, 3))
-    if not is_orthonormal(rotation):
+    if not is_rotation(rotation):
         raise DatasetError(f"the camera of {name} has a cam_R_w2c that is no rotation")
     return lens, camera["cam_t_w2c"], rotation
 
