@@ -115,23 +115,11 @@ def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: li
     interpreter lock; so pieces of whole tiles run in parallel in a thread pool, which does not change the result. Kernels launched so must
     not use Warp's tile functions, whose CPU storage is found by one static pointer per module; its debug mode follows that pointer always.
     """
-    kernel = kernel_for(kernel, *inputs)
-    if device.is_cuda:
-        wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
-        return
-    if _cores() == 1 or pixels <= CPU_PIECE_PIXELS:
-        wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device)
-        return
-    # Loading a module from several threads at once is not safe.
-    kernel.module.load(device, 1)
-    tiles = -(-pixels // (CPU_PIECES * _cores() * int(TILE_PIXELS)))
-    size = max(CPU_PIECE_PIXELS, tiles * int(TILE_PIXELS))
-
-    def launch_piece(first: int) -> None:
-        wp.launch(kernel, dim=min(size, pixels - first), inputs=[*inputs, first], outputs=outputs, device=device)
-
-    for _ in _pool().map(launch_piece, range(0, pixels, size)):
-        pass
+    size = pixels
+    if device.is_cpu and _cores() > 1:
+        tiles = -(-pixels // (CPU_PIECES * _cores() * int(TILE_PIXELS)))
+        size = max(CPU_PIECE_PIXELS, tiles * int(TILE_PIXELS))
+    _launch_pieces(kernel, range(0, pixels, size or 1), pixels, inputs, outputs, device)
 
 
 def launch_views(
@@ -142,15 +130,23 @@ def launch_views(
     Threads of one view may write the same elements by atomic operations. The kernel's last input is the index of the first thread. On the
     CPU, where Warp's atomic operations are not atomic, the threads of a view run sequentially, and views in parallel.
     """
+    first, end = first_view * threads, (first_view + views) * threads
+    starts = range(first, end, (views * threads if device.is_cuda else threads) or 1)
+    _launch_pieces(kernel, starts, end, inputs, outputs, device)
+
+
+def _launch_pieces(kernel: wp.Kernel, starts: range, end: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
+    """Launch a kernel over the threads from each of `starts` to the next one or `end`, several in a thread pool."""
     kernel = kernel_for(kernel, *inputs)
-    if device.is_cuda:
-        first = first_view * threads
-        wp.launch(kernel, dim=views * threads, inputs=[*inputs, first], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
-        return
-    kernel.module.load(device, 1)
 
-    def launch_view(view: int) -> None:
-        wp.launch(kernel, dim=threads, inputs=[*inputs, view * threads], outputs=outputs, device=device)
+    def launch_piece(first: int) -> None:
+        dim = min(starts.step, end - first)
+        wp.launch(kernel, dim=dim, inputs=[*inputs, first], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
 
-    for _ in _pool().map(launch_view, range(first_view, first_view + views)):
-        pass
+    if len(starts) > 1:
+        # Loading a module from several threads at once is not safe.
+        kernel.module.load(device, 1)
+        for _ in _pool().map(launch_piece, starts):
+            pass
+    elif starts:
+        launch_piece(starts[0])
