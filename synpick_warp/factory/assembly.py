@@ -9,6 +9,7 @@ import gc
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -329,9 +330,8 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     own = tuple(cameras[camera] for camera in indices)
     scene, rig, first = with_cameras(scene, own), config.rig, indices[0]
     chosen = replace(config, render=replace(config.render, layers=group_layers(config.rig, config.render, index)))
-    colors = rig.writes(first, COLOR)
-    shutter = rig.shutter(first)
-    renderer = make_renderer(chosen, scene, objects, sizes["view"], history_count(rig, worlds, index), colors, shutter)
+    colors, histories = rig.writes(first, COLOR), history_count(rig, worlds, index)
+    renderer = make_renderer(chosen, scene, objects, sizes["view"], rig.shutter(first), histories=histories, colors=colors)
     lenses = tuple(camera.lens for camera in own) if rig.draws_lens(first) else ()
     pooled = sizes["mask_word"] < objects * most_words(*rig.sizes[first])
     bounds = MaskBounds.of(scene.meshes, own) if pooled else None
@@ -372,18 +372,10 @@ def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device
 
 
 def make_renderer(
-    config: Config,
-    scene: RenderScene,
-    instances: int,
-    views: int,
-    histories: int = 0,
-    colors: bool = True,
-    shutter: tuple[float, float] = (0.0, 0.0),
+    config: Config, scene: RenderScene, instances: int, views: int, shutter: tuple[float, float] = (0.0, 0.0), **given: Any
 ) -> Renderer:
     """Create the renderer of a bake from its sections of the settings, for `instances` instances a world and at most `views` views a batch.
-
-    `histories`, `colors`: see `Renderer`. `shutter`: as of `Rig.shutter`.
-    """
+    `shutter`: as of `Rig.shutter`. `given`: histories and colors, as of `Renderer`."""
     return Renderer(
         scene,
         config.render,
@@ -393,7 +385,6 @@ def make_renderer(
         depth_scale=config.bop.depth_scale,
         instances=instances,
         views=views,
-        histories=histories,
-        colors=colors,
+        **given,
         shutter=(shutter[0] / config.physics.tick_time, shutter[1] / config.physics.tick_time),
     )

@@ -101,7 +101,7 @@ def measure_pictures(bench: Bench) -> Iterator[MeasuredRow]:
         yield MeasuredRow("paths in a history before a pass, mean", float(paths.mean()), "")
         scene, count = ring.renderer.scene, history.frame.shape[0]
         for setting, value, histories in (("render.reuse", False, count), ("render.history", 0, 0)):
-            other = make_renderer(config.with_values({setting: value}), scene, ring.instances, ring.batch, histories)
+            other = make_renderer(config.with_values({setting: value}), scene, ring.instances, ring.batch, histories=histories)
             renderers[f"all stages, {setting}={str(value).lower()}"] = other
     megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
     for name, times in _time_passes(stream, renderers, ticks).items():

@@ -37,7 +37,7 @@ def expose(toy: ToyScene, device, shutter, step=(STEP, 0.0, 0.0), worlds=(0,), c
     """Colour images and radiance of views, in which instance 0 of `worlds` moved by a step; `carried`: the camera's step [m]."""
     render_scene, views = build_scene(toy, device), views_of(toy, device)
     times = tuple(share * TICK for share in shutter)
-    renderer = make_renderer(toy.settings(), render_scene, toy.instances, views.count, histories, shutter=times)
+    renderer = make_renderer(toy.settings(), render_scene, toy.instances, views.count, times, histories=histories)
     out = allocate_view_buffers(views.count, render_scene.width, render_scene.height, toy.instances, device)
     world = snapshot(toy, device)
     last = world.pose.numpy().copy()

@@ -94,7 +94,7 @@ def link(state: Snapshot, before: Snapshot) -> None:
 @pytest.fixture
 def renderer(device) -> Renderer:
     each = toy()
-    return make_renderer(each.settings(), build_scene(each, device), each.instances, 1, 1)
+    return make_renderer(each.settings(), build_scene(each, device), each.instances, 1, histories=1)
 
 
 def usable(paths: int, limit: int, device: wp.Device) -> tuple[int, int]:
@@ -185,7 +185,7 @@ def test_accumulated_light_does_not_depend_on_the_unit_of_maps(device, scale):
     colors = []
     for light in (LIGHT, EnvironmentMap("scaled", scale * LIGHT.radiance)):
         each = replace(toy(), lights=(light,))
-        made = make_renderer(each.settings(), build_scene(each, device), each.instances, 1, 1)
+        made = make_renderer(each.settings(), build_scene(each, device), each.instances, 1, histories=1)
         factor = made.scene.lights.exposure.numpy()[0]
         colors.append([factor * radiance for radiance in show(made, [(frame, each) for frame in range(4)], device)])
     np.testing.assert_allclose(colors[1], colors[0], rtol=5e-3, atol=1e-3)
@@ -335,7 +335,7 @@ def make_queues(renderer: Renderer, regions: int, views: int = 1) -> Any:
 def light_of(bounces: int, walls: bool, paths: int, regions: int, device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
     """Radiance of all frames, and the number of paths in the first stage's queues after each (frame, region)."""
     each = pile(0, bounces, walls, paths)
-    renderer = make_renderer(each.settings(), build_scene(each, device), each.instances, 1, 1)
+    renderer = make_renderer(each.settings(), build_scene(each, device), each.instances, 1, histories=1)
     renderer.shading.queues = make_queues(renderer, regions)  # type: ignore[union-attr]
     images, counts = [], []
     for image in show(renderer, [(frame, pile(frame, bounces, walls, paths)) for frame in range(FRAMES)], device):

@@ -143,7 +143,7 @@ def renderers(device: wp.Device) -> tuple[Renderer, Renderer]:
     """Two renderers of the same scene: with histories, and without."""
     each = stirred(0)
     scene = build_scene(each, device)
-    return make_renderer(each.settings(), scene, each.instances, 1, 1), make_renderer(each.settings(), scene, each.instances, 1, 0)
+    return make_renderer(each.settings(), scene, each.instances, 1, histories=1), make_renderer(each.settings(), scene, each.instances, 1)
 
 
 def rays(renderer: Renderer) -> np.ndarray:
