@@ -14,11 +14,11 @@ from synpick_warp.environment.picking import TWIST_SPEED
 from synpick_warp.environment.settings import make_choice
 from synpick_warp.errors import ActionError, ConfigError, StateError
 from synpick_warp.stages.perception.candidates import CandidateSampler
-from synpick_warp.stages.sim.trials import Trials, own_grasps
+from synpick_warp.stages.sim.trials import Trials
 from synpick_warp.system.random_numbers import mix
 from tests.builders import PICKING, boxes
 from tests.environment.conftest import build, centers, same
-from tests.worlds.small_worlds import QUICK
+from tests.worlds.small_worlds import QUICK, own_grasps
 
 FLOOR = 1e-3
 """Error of a point on the floor of the tote, by a depth in single precision [m]."""

@@ -26,11 +26,11 @@ from synpick_warp.stages.render.layers import LayerRenderer
 from synpick_warp.stages.render.view_setup import make_shot
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.sim.trials import ChoiceReader, Trials, check_grasps, find_choices, own_grasps, trial_values
+from synpick_warp.stages.sim.trials import ChoiceReader, Trials, check_grasps, trial_values
 from synpick_warp.views.layers import LAYER_TABLE
 from tests.worlds.hanging import Hanging
 from tests.worlds.kernel_worlds import filled
-from tests.worlds.small_worlds import brief, picking, report
+from tests.worlds.small_worlds import brief, find_choices, own_grasps, picking, report
 
 ABOVE = 0.25
 """Height of a grasp in the air above the pile [m]."""

@@ -9,6 +9,7 @@ import trimesh
 import warp as wp
 from scipy.spatial.distance import pdist
 
+from synpick_warp.codes import Task
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes import build
@@ -172,3 +173,16 @@ def brief(device: Any, worlds: int, **changed: Any) -> Simulation:
 def picking(config: Config, objects: Catalog, device: Any, **other: Any) -> Simulation:
     """Simulation with perception; `other`: further arguments of `Simulation`."""
     return Simulation(config, objects, LIGHTS, device, render_scene(config, objects, device), **other)
+
+
+def find_choices(simulation: Simulation) -> np.ndarray:
+    """Worlds at a moment of choice: an attempt was planned in this tick, and begins with the next. Waits for the device."""
+    task, steps = simulation.attempts.task.numpy(), simulation.attempts.steps.numpy()
+    return np.flatnonzero((task == Task.APPROACH) & (steps == 0))
+
+
+def own_grasps(simulation: Simulation, worlds: Sequence[int]) -> dict[str, np.ndarray]:
+    """Planned grasps of worlds as the arrays of `Trials.upload`: row i is the i-th of `worlds`, candidate 0. Waits for the device."""
+    plan = simulation.plan
+    arrays = {name: getattr(plan, name).numpy()[np.asarray(worlds, int)] for name in ("target", "point", "normal", "yaw", "tilt")}
+    return {"row": np.arange(len(worlds), dtype=np.int32), "candidate": np.zeros(len(worlds), np.int32)} | arrays

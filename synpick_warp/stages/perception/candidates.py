@@ -62,7 +62,7 @@ class CandidateSampler:
         self._graph: wp.Graph | None = None
 
     def sample(self, state: State, rows: Sequence[int]) -> tuple[Any, Any, np.ndarray]:
-        """Sample the candidates of saved states. Waits for the device. `state`: states at moments of choice (`trials.find_choices`).
+        """Sample the candidates of saved states. Waits for the device. `state`: states at moments of choice, as of `Trials.run`.
         `rows`: its rows to sample. Returns the structs `Grasps` and `Candidates`, with `count` consecutive elements per row, and the
         visible instances (row, instance) bool. All fields of a row without visible instances are 0, or the planned grasp's."""
         sizes = {"grasp": len(rows) * self.count}

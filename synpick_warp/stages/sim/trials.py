@@ -4,7 +4,7 @@ States are saved at moments of choice: ends of ticks in which an attempt was pla
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -117,7 +117,7 @@ class Trials:
     def run(self, state: State, grasps: Any) -> dict[str, np.ndarray]:
         """Run all trials of grasps (the struct `Grasps`). Waits for the device.
 
-        States are at moments of choice: an attempt is planned and has made no step (`find_choices`); also of other simulations of the same
+        States are at moments of choice: an attempt is planned and has made no step; also of other simulations of the same
         objects. Returns the fields of `Labels` and `Perturbations` by name (trial, ...), with `repeats` consecutive trials of each grasp.
         """
         sizes = {"trial": len(grasps.row) * self.course.repeats}
@@ -177,19 +177,6 @@ def make_course(settings: Picks, physics: PhysicsConfig, pick: Pick) -> Any:
         moved_distance=MOVED,
         base_friction=physics.friction,
     )
-
-
-def find_choices(simulation: Simulation) -> np.ndarray:
-    """Worlds at a moment of choice: an attempt was planned in this tick, and begins with the next. Waits for the device."""
-    task, steps = simulation.attempts.task.numpy(), simulation.attempts.steps.numpy()
-    return np.flatnonzero((task == Task.APPROACH) & (steps == 0))
-
-
-def own_grasps(simulation: Simulation, worlds: Sequence[int]) -> dict[str, np.ndarray]:
-    """Planned grasps of worlds as the arrays of `Trials.upload`: row i is the i-th of `worlds`, candidate 0. Waits for the device."""
-    plan = simulation.plan
-    arrays = {name: getattr(plan, name).numpy()[np.asarray(worlds, int)] for name in ("target", "point", "normal", "yaw", "tilt")}
-    return {"row": np.arange(len(worlds), dtype=np.int32), "candidate": np.zeros(len(worlds), np.int32)} | arrays
 
 
 def check_grasps(grasps: Mapping[str, np.ndarray], rows: int, instances: int) -> int:
