@@ -201,27 +201,23 @@ def filter_shadows_kernel(scene: PathScene, coarse: CoarseGrid, shot: AnyShot, t
     write_uint64(shadows_out.fractions, flat_index(coarse.grid, view, row, column), fractions)
 
 
-@wp.func_native("""
+_CHOOSE_BYTES = """
     uint32_t result = 0;
     for (int shift = 0; shift < 32; shift += 8) {
         const uint32_t x = a & (0xFFu << shift), y = b & (0xFFu << shift);
         result |= x < y ? x : y;
     }
     return result;
-""")
+"""
+
+
+@wp.func_native(_CHOOSE_BYTES)
 def min_bytes(a: wp.uint32, b: wp.uint32) -> wp.uint32:
     """Minimum of each of the four bytes of two words."""
     ...
 
 
-@wp.func_native("""
-    uint32_t result = 0;
-    for (int shift = 0; shift < 32; shift += 8) {
-        const uint32_t x = a & (0xFFu << shift), y = b & (0xFFu << shift);
-        result |= x > y ? x : y;
-    }
-    return result;
-""")
+@wp.func_native(_CHOOSE_BYTES.replace("x < y", "x > y"))
 def max_bytes(a: wp.uint32, b: wp.uint32) -> wp.uint32:
     """Maximum of each of the four bytes of two words."""
     ...
