@@ -154,11 +154,6 @@ class DataLayout:
         """Exclusive upper bound of the planned episode indices, over all splits."""
         return max(each.stop for each in self.plan())
 
-    @property
-    def scenes_end(self) -> int:
-        """Exclusive upper bound of the planned scene ids of the format shards, which has a scene per episode and camera."""
-        return self.episodes_end * self.cameras
-
     def split_of(self, episode: int) -> Split | None:
         """Split of an episode index; None if there are no splits.
 

@@ -1,5 +1,6 @@
 """Parts of what trains without files: the online stream beside the bare renderer, and steps of the environment."""
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -89,7 +90,8 @@ def measure_stream(bench: Bench, factory: Factory, report: TickReport) -> Iterat
     yield MeasuredRow("views in a batch", ring.views, "")
     still, ticks = ViewStream(_StillProducer(report, *parts)), ViewStream(_UnloggedProducer(*parts))
     consume = _consumer(bench.device)
-    yield from _compare(bench, {"renderer alone": _render_loop(factory, ring, report), "stream of one tick": map(consume, still)})
+    bare = (views for _ in itertools.count() for views in _render_all(factory, ring, factory.simulation.record.snapshot, report))
+    yield from _compare(bench, {"renderer alone": bare, "stream of one tick": map(consume, still)})
     yield from _compare(bench, {"simulation and renderer alone": _tick_loop(factory, ring), "stream of ticks": map(consume, ticks)})
 
 
@@ -138,12 +140,6 @@ def _consumer(device: wp.Device) -> Callable[[ViewBatch], int]:
         return len(batch)
 
     return consume
-
-
-def _render_loop(stages: Stages, ring: BatchRing, report: TickReport) -> Iterator[int]:
-    """Render the views of one tick repeatedly into one buffer; yields the number of views of each batch."""
-    while True:
-        yield from _render_all(stages, ring, stages.simulation.record.snapshot, report)
 
 
 def _tick_loop(stages: Stages, ring: BatchRing) -> Iterator[int]:

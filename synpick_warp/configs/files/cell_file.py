@@ -18,6 +18,7 @@ from synpick_warp.configs.files.table_lists import given_values
 
 WIDTH = 120
 """Longest comment line [characters]."""
+_WRAPPER = textwrap.TextWrapper(WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False, break_on_hyphens=False)
 FILL, _FEW = 0.1, 4
 """Volume of an episode's objects, as a fraction of the bin's, and their largest number: a few minutes on a CPU."""
 VACUUM = 60.0
@@ -154,10 +155,6 @@ def _title(text: str) -> list[str]:
     return [f"# ---- {text} ----", ""]
 
 
-def _comment(text: str) -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False, break_on_hyphens=False)
-
-
 def _section(section: str, values: Mapping[str, Any], examples: Mapping[str, Any]) -> list[str]:
     """Lines of a section, with settings and with examples that are commented out."""
     return _table(f"[{section}]", section, values, examples)
@@ -169,6 +166,6 @@ def _table(header: str, name: str, values: Mapping[str, Any], examples: Mapping[
     lines = [header]
     for mark, settings in (("", values), ("#", examples)):
         for key, value in settings.items():
-            lines += _comment(describe_setting(known[key])) if first else []
+            lines += _WRAPPER.wrap(describe_setting(known[key])) if first else []
             lines.append(f"{mark}{key} = {format_toml(given_values(value) if is_table(type(value)) else value)}")
     return [*lines, ""]

@@ -207,8 +207,8 @@ def _split_folders(splits: Sequence[Split], bop: Bop) -> Iterator[Conflict]:
 
 
 def _scene_ids(layout: DataLayout) -> Iterator[Conflict]:
-    """Yield the number of episodes if shards have no names for so many scenes."""
-    if "shards" in layout.formats and layout.scenes_end > MAX_SHARD_SCENES:
+    """Yield the number of episodes if shards have no names for so many scenes, one per episode and camera."""
+    if "shards" in layout.formats and layout.episodes_end * layout.cameras > MAX_SHARD_SCENES:
         most = MAX_SHARD_SCENES // layout.cameras
         long = next((split.name for split in layout.splits if split.first + split.episodes > most), "")
         key = f"splits.{long}.episodes" if long else "bake.episodes"

@@ -389,11 +389,6 @@ def lamp_shares(tables: list[EnvironmentTables]) -> np.ndarray:
     return (lamps / np.maximum(upward + lamps.sum(axis=1), 1e-9)[:, None])[..., None]
 
 
-def shadowed_lamps(settings: schema.Render) -> int:
-    """Maximum number of lamps of a map that get shadow rays; mode unoccluded, which is for speed, takes the strongest alone."""
-    return min(settings.lamps, 1) if settings.mode == schema.UNOCCLUDED else settings.lamps
-
-
 def build_suction_scene(catalog: Catalog, radius: float, device: wp.Device) -> Any:
     """The struct `SuctionScene` of a cup of `radius` [m]."""
     suction = SuctionScene()
@@ -449,7 +444,9 @@ def build_render_scene(
     paths = PathScene()
     paths.meshes, paths.table = meshes, build_table(settings, table_height)
     paths.surfaces = build_surfaces(shapes, materials, device)
-    paths.lights = build_lights(lights, ground, settings.exposure, device, shadowed_lamps(settings))
+    # Mode unoccluded, which is for speed, takes the strongest lamp alone.
+    lamps = min(settings.lamps, 1) if settings.mode == schema.UNOCCLUDED else settings.lamps
+    paths.lights = build_lights(lights, ground, settings.exposure, device, lamps)
     paths.cdf = build_environment_cdf(paths.lights.radiance.numpy()[..., :3], device, settings.table)
     return RenderScene(
         meshes=meshes,

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import synpick_warp
-from synpick_warp.apps.evaluation.twins import UNIT, Shot, Twin, render_twins
+from synpick_warp.apps.evaluation.twins import UNIT, Shot, render_twins
 from synpick_warp.configs.files.load import parse_assignment
 from synpick_warp.errors import ConfigError
 from synpick_warp.online.render import SceneRenderer
@@ -31,11 +31,9 @@ def render_frames(frames: Sequence[RealFrame], options: argparse.Namespace) -> l
         return list(frames)
     meshes = sorted({path for shot in shots for path, _ in shot.objects})
     twins = render_twins(shots, SceneRenderer(meshes, [shots[0].camera], (), UNIT, options.device, settings))
-    return [_with_twin(frame, next(twins)) if frame.object_ids else frame for frame in frames]
-
-
-def _with_twin(frame: RealFrame, twin: Twin) -> RealFrame:
-    return replace(frame, color=twin.color, label=np.array([0, *frame.object_ids], np.uint8)[twin.instance])
+    labels = (np.array([0, *frame.object_ids], np.uint8) for frame in frames if frame.object_ids)
+    made = (replace(twin.shot.source, color=twin.color, label=label[twin.instance]) for twin, label in zip(twins, labels, strict=True))
+    return [next(made) if frame.object_ids else frame for frame in frames]
 
 
 def _make_shot(frame: RealFrame, models: Path) -> Shot:
