@@ -147,8 +147,8 @@ def test_first_frames_rest(device):
 
 
 def test_turning_bodies_turn_about_their_origin(device):
-    """A quarter of the motion of a half turn a frame: corners reach as far as edges."""
-    entries = [entry(box(0.2, 0.2, 0.01), surface())]
+    """A black square, which turns by 45 degrees while it is exposed, before a white sky: its corners are seen as long as they pass."""
+    entries = [entry(box(0.2, 0.2, 0.01), surface((0.0, 0.0, 0.0)))]
     turned = (0.0, 0.0, 0.0, 0.0, 0.0, np.sin(np.pi / 8), np.cos(np.pi / 8))
     toy = ToyScene(entries, [[(0, turned)]], (camera(48, 48, 128.0, (0.0, 0.0, TOP)),), config=with_render(UNOCCLUDED, shutter_samples=16))
     render_scene, views = build_scene(toy, device), views_of(toy, device)
@@ -160,6 +160,11 @@ def test_turning_bodies_turn_about_their_origin(device):
     world.last_catalog_index.assign(world.catalog_index)
     world.follows.fill_(1)
     renderer.render(world, views, out)
-    # 90 degrees of symmetry: an exposure of a turn by 45 about the middle of 45 is the mirror image of itself along either diagonal.
+    # In the middle of the exposure a corner points upward, so the picture is its own mirror image.
     light = renderer.image.radiance.numpy()[0, ..., 0]
-    np.testing.assert_allclose(light, light[:, ::-1], atol=0.06 * light.max())
+    share = (light - light[0, 0]) / (light[24, 24] - light[0, 0])
+    np.testing.assert_allclose(share, share[:, ::-1], atol=0.1)
+    side, place = 128.0 * 0.1 / 0.995, 24 - 8.5  # Half the side, and a pixel's distance from the centre [px].
+    passing = 2 * (45.0 - np.degrees(np.arccos(side / place))) / 45.0
+    np.testing.assert_allclose(share[8, 23:25], passing, atol=1 / 16)
+    assert abs(share[13, 34]) < 0.06  # As far from the centre, to the upper right, where no corner passes.
