@@ -198,6 +198,11 @@ NOT_FIXED = "in {path}; allowed: the name of a camera that is fixed to the world
             LEFT + "exposure_time = 0.04\nreadout_time = 0.03\n",
             "camera[0].exposure_time is 0.04 in {path}; allowed: with readout_time at most 0.066",
         ),
+        (
+            LEFT + 'exposure_time = 0.01\nmodalities = ["depth"]\n',
+            "exposure_time is 0.01 in {path}; allowed: 0 in mode still and without",
+        ),
+        (LEFT + 'readout_time = 0.01\n[bake]\nmode = "still"\n', "readout_time is 0.01 in {path}; allowed: 0 in mode still and without"),
         (LEFT + "readout_time = 0.07\n", "allowed: with exposure_time at most 0.066, the time from one frame to the next [s]"),
         (LEFT + "every = 0\n", "camera[0].every is 0 in {path}; allowed: at least 1, at most 1000 [frames]"),
         (LEFT + 'every = 2\n[bake]\nformats = ["lerobot"]\n', "camera[0].every is 2 in {path}; allowed: 1 with the format lerobot"),

@@ -361,8 +361,8 @@ class Rig:
         return bool(self.dome) or self.rows[index].jitter is not None or self.moves(index)
 
     def shutter(self, index: int) -> tuple[float, float]:
-        """Exposure and readout time of a camera [s]; 0, 0: its pictures are of an instant, or those of piles at rest."""
-        return (0.0, 0.0) if self.still else (self.rows[index].exposure_time, self.rows[index].readout_time)
+        """Exposure and readout time of a camera [s]; 0, 0: its pictures are of an instant."""
+        return self.rows[index].exposure_time, self.rows[index].readout_time
 
     def draws_lens(self, index: int) -> bool:
         """Whether a camera has lens distortion and intrinsics that are randomized per episode, so that the rays of its pixels change."""

@@ -154,6 +154,8 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     if sum(times := rig.shutter(index)) > config.physics.tick_time:
         name, other = ("exposure_time", "readout_time")[:: -1 if times[1] > times[0] else 1]
         yield rig.key(index, name), f"with {other} at most {config.physics.tick_time:g}, the time from one frame to the next [s]"
+    elif any(times) and (rig.still or not rig.writes(index, "color")):
+        yield rig.key(index, "exposure_time" if times[0] else "readout_time"), "0 in mode still and without colour: nothing is blurred"
     keys = [rig.key(index, "pose", name) for name in ("positions", "ups", "target")]
     placement = partial(_placement, label=label, bins=bins, shift=config.bins.shift)
     if rig.moves(index):
