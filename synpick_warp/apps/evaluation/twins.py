@@ -68,14 +68,14 @@ class Shot(NamedTuple):
     """Annotated image, of which a twin is rendered."""
 
     source: Any
-    """What it is made of."""
+    """Where the image comes from; passed through."""
     color: np.ndarray
     """(H, W, 3) uint8."""
     objects: list[tuple[Path, np.ndarray]]
-    """Model file [mm], and object to world (4, 4) [m], of each, at least one."""
+    """For each object, at least one: path of its model [mm] and its object-to-world pose (4, 4) [m]."""
     camera: Camera
     shown: np.ndarray | None = None
-    """Where objects are visible in the image (H, W) bool; None: wherever they are rendered."""
+    """Mask of the annotated visible pixels (H, W) bool; None: all rendered pixels."""
 
 
 class Twin(NamedTuple):
@@ -83,9 +83,9 @@ class Twin(NamedTuple):
 
     shot: Shot
     color: np.ndarray
-    """(H, W, 3) uint8; the image's own pixels at outlines and beyond, and grey if the image is."""
+    """Composite image (H, W, 3) uint8: objects without their outlines are rendered, all other pixels are copied; grey for a grey image."""
     instance: np.ndarray
-    """Number of the object that each pixel shows (H, W) uint8, from 1; 0: none."""
+    """Instance mask (H, W) uint8: 1-based index into `Shot.objects`; 0: background."""
     depth: np.ndarray
     """Planar depth (H, W) float32 [m]; 0: no object."""
 
@@ -207,7 +207,7 @@ def _has_depth(view: View) -> bool:
 
 
 def _read_record(path: Path) -> dict[str, list[Likeness]]:
-    """Likeness of the objects of each image that an earlier run has finished; lines from the first that is damaged on are cut off."""
+    """Read RECORD of an interrupted run: likenesses by image path. The file is truncated at the first damaged line."""
     made, size = dict[str, list[Likeness]](), 0
     if path.exists():
         with suppress(msgspec.MsgspecError):

@@ -252,7 +252,7 @@ def describe_differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> s
 
 
 def describe_inputs(here: Mapping[str, str], there: Mapping[str, str]) -> str:
-    """Describe the inputs whose digests differ, as in "objects and lights (24: bowl)", or return an empty string if all are equal."""
+    """Format the names of inputs whose digests differ, e.g. "objects and lights (24: bowl)"; an empty string if none do."""
     differing = [name for name in {**here, **there} if here.get(name) != there.get(name)]
     kinds = " and ".join(_show_key(name) for name in differing if not name.startswith(OBJECT))
     objects = [_show_key(name.removeprefix(OBJECT)) for name in differing if name.startswith(OBJECT)]

@@ -1,5 +1,5 @@
-"""Cache of detected symmetries in the user's cache folder. A key is a hash of the mesh, the tolerance and the sources of the detection, so
-that commands on the same part detect its symmetries once, and a change of the program detects them anew."""
+"""Cache of detected symmetries in the user's cache folder. The key is a hash of the mesh, the tolerance and the source code of
+the detection: symmetries of a part are detected once, and again after the code has changed."""
 
 import contextlib
 import hashlib

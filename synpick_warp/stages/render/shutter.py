@@ -28,10 +28,11 @@ SEED_STEP = 0x9E3779B97F4A7C15
 
 
 def plan_sub_frames(exposure: float, readout: float, count: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times (sub_frame) of `count` sub-frames, from the middle of the middle row's exposure, and their weights in each row, whose sum is 1
-    (sub_frame, row); times are in the unit of `exposure` and `readout`.
+    """Sampling times of `count` sub-frames (sub_frame), relative to the middle row's mid-exposure, in the unit of `exposure` and `readout`,
+    and the averaging weights of each row (sub_frame, row), which sum to 1 over the sub-frames.
 
-    Sub-frames stand for equal parts of the time in which any row is exposed. An exposure counts as at least one such part."""
+    Sub-frames are the midpoints of equal intervals from the first row's start to the last row's end of exposure. The exposure of a row is
+    at least one interval."""
     exposure = max(exposure, readout / (count - 1))
     part = (exposure + readout) / count
     times = (np.arange(count) + 0.5 - count / 2) * part

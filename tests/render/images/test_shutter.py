@@ -19,7 +19,7 @@ WIDTH, HEIGHT, FOCAL, TOP = 64, 24, 64.0, 1.0
 VIEW = camera(WIDTH, HEIGHT, FOCAL, (0.0, 0.0, TOP))
 BENT = distorted(VIEW, -0.1, 0.05, 0.0, 0.0)
 SPEED = 16.0
-"""Motion in a frame [px], at `TOP` below the camera."""
+"""Image-space displacement per frame [px] of a point at depth `TOP`."""
 STEP = SPEED * TOP / FOCAL
 """The same [m]."""
 SAMPLES = 32
@@ -147,7 +147,7 @@ def test_first_frames_rest(device):
 
 
 def test_turning_bodies_turn_about_their_origin(device):
-    """A black square, which turns by 45 degrees while it is exposed, before a white sky: its corners are seen as long as they pass."""
+    """Coverage of a black square that rotates by 45 degrees during the exposure, in front of a white background."""
     entries = [entry(box(0.2, 0.2, 0.01), surface((0.0, 0.0, 0.0)))]
     turned = (0.0, 0.0, 0.0, 0.0, 0.0, np.sin(np.pi / 8), np.cos(np.pi / 8))
     toy = ToyScene(entries, [[(0, turned)]], (camera(48, 48, 128.0, (0.0, 0.0, TOP)),), config=with_render(UNOCCLUDED, shutter_samples=16))
@@ -160,7 +160,7 @@ def test_turning_bodies_turn_about_their_origin(device):
     world.last_catalog_index.assign(world.catalog_index)
     world.follows.fill_(1)
     renderer.render(world, views, out)
-    # In the middle of the exposure a corner points upward, so the picture is its own mirror image.
+    # At mid-exposure a corner points upward, so the image is mirror-symmetric.
     light = renderer.image.radiance.numpy()[0, ..., 0]
     share = (light - light[0, 0]) / (light[24, 24] - light[0, 0])
     np.testing.assert_allclose(share, share[:, ::-1], atol=0.1)

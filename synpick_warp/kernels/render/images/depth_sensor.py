@@ -26,8 +26,8 @@ def disparity_at(gbuffer: GBuffer, focal_baseline: float, view: int, row: int, c
 
 @wp.func
 def near_discontinuity(shot: AnyShot, sensor: SensorParameters, focal_baseline: float, view: int, row: int, column: int) -> bool:
-    """Edge invalidation: True if disparities within the matching window differ by more than the threshold from the centre's. A window over
-    two surfaces has no match, or that of the wrong surface."""
+    """Edge invalidation: True if any disparity in the matching window differs from the center's by more than the threshold. Block matching
+    fails, or matches the wrong surface, where a window covers a depth discontinuity."""
     here = disparity_at(shot.gbuffer, focal_baseline, view, row, column)
     for down in range(-sensor.edge_width, sensor.edge_width + 1):
         for right in range(-sensor.edge_width, sensor.edge_width + 1):

@@ -84,7 +84,7 @@ def pack_normal(normal: wp.vec3) -> int:
 
 @wp.func
 def octahedral_vector(packed: int) -> wp.vec3:
-    """Vector of some length in the direction that `pack_normal` rounded, up to 8° from the normal."""
+    """Decode a normal of `pack_normal` (octahedral mapping), not normalized; its direction is up to 8° off."""
     p = 2.0 * float((packed >> 4) & 15) / float(NORMAL_STEPS) - 1.0
     q = 2.0 * float(packed & 15) / float(NORMAL_STEPS) - 1.0
     x = 0.5 * (p + q)
@@ -94,7 +94,7 @@ def octahedral_vector(packed: int) -> wp.vec3:
 
 @wp.func
 def unpack_normal(packed: int) -> wp.vec3:
-    """Unit vector of `octahedral_vector`."""
+    """Decode a normal of `pack_normal` to a unit vector, up to 8° off."""
     return wp.normalize(octahedral_vector(packed))
 
 

@@ -151,8 +151,8 @@ def lag_limit(
 
 @wp.func
 def period_bits(paths: int, limit: int) -> int:
-    """Binary logarithm of a coarse pixel's update period: with 2, 4, 8 paths it traces one every 2, 4, 8 frames; 0: every frame. The period
-    is shortened until MIN_SKIP_PATHS periods fit into `limit` frames, see `lag_limit`."""
+    """Base-2 logarithm of a coarse pixel's update period [frames]: a history of 2, 4 or 8 paths receives a new path every 2, 4 or 8 frames;
+    0: every frame. The period is limited so that MIN_SKIP_PATHS periods fit into `limit` frames, see `lag_limit`."""
     bits = int(0)
     while bits < MAX_PERIOD_BITS and (MIN_SKIP_PATHS << bits) <= paths and (MIN_SKIP_PATHS << (bits + 1)) <= limit:
         bits += 1
@@ -171,8 +171,8 @@ def usable_paths(history: LightHistory, slot: int, row: int, column: int, limit:
 
 @wp.func
 def path_number(frame: int, bits: int) -> int:
-    """Index of a coarse pixel's path in its sequence, distinct within a history of default length that begins in any frame. Each update
-    period has a part of the sequence of its own, PERIOD_PATHS long, and takes its paths in order."""
+    """Sample index of a coarse pixel's path; unique within a history of default length. Each update period uses its own range of
+    PERIOD_PATHS consecutive indices."""
     return (frame >> bits) % PERIOD_PATHS + PERIOD_PATHS * bits
 
 

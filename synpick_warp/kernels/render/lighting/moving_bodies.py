@@ -85,8 +85,8 @@ def same_pose(now: wp.transformf, then: wp.transformf) -> bool:
 
 @wp.func
 def world_box(meshes: Meshes, mesh: int, pose: wp.transformf) -> tuple[wp.vec3, wp.vec3]:
-    """Lower and upper corner of the axis-aligned box, in the world, around a mesh's bounding box at a pose; an empty box for mesh -1. It is
-    wider by RAY_OFFSET, since rays that are tested against it start at surfaces, and those that are traced above them."""
+    """World-space axis-aligned bounding box (AABB) of a posed mesh: lower and upper corner; empty for mesh -1. It is padded by RAY_OFFSET,
+    because rays are traced from an offset above the surface, but tested against the box from the surface itself."""
     if mesh < 0:
         return wp.vec3(FAR, FAR, FAR), wp.vec3(-FAR, -FAR, -FAR)
     half = 0.5 * (meshes.upper[mesh] - meshes.lower[mesh])

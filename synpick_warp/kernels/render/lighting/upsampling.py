@@ -21,10 +21,10 @@ from synpick_warp.kernels.render.visibility.camera import clamp_index
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 PLANE_WIDTH = wp.constant(0.03)
-"""Distance from the pixel's tangent plane at which a coarse pixel's weight has fallen to a quarter [coarse pixels]. With a hard bound of
-one coarse pixel, metal has teeth at the edges of its faces (PSNR of brackets in a bin at full HD: 29.8 dB, 30.3 dB so)."""
+"""Plane distance at which the edge-stopping weight falls to 1/4 [coarse pixels]. A hard threshold of one coarse pixel gives jagged edges
+between the faces of metal parts (brackets in a bin at full HD: PSNR 29.8 dB instead of 30.3 dB)."""
 ON_SURFACE = wp.constant(0.1)
-"""Least edge-stopping weight of a coarse pixel that is taken for one on the pixel's surface."""
+"""Minimum edge-stopping weight at which a coarse pixel counts as part of the pixel's surface."""
 RING = wp.constant(1)
 """Upsampling fallback: the four nearest coarse pixels are widened by this many on each side if none of them is on the surface."""
 RatioRecord = wp.types.vector(length=3, dtype=wp.uint64)
@@ -88,8 +88,8 @@ def add_ratios(total: Ratios, record: RatioRecord, weight: float) -> Ratios:
 
 @wp.func
 def upsampling_weight(record: RatioRecord, coarse: CoarseGrid, plane: Plane, row: int, column: int, r: int, c: int) -> float:
-    """Edge-stopping weight of the coarse pixel (r, c) for the pixel (row, column): 1 on its tangent plane, less with the distance from it
-    and by the 4th power of the normals' cosine, but at least MIN_WEIGHT; that on other bodies, 0 on background."""
+    """Edge-stopping weight of the coarse pixel (r, c) for the pixel (row, column): 1 on its tangent plane, decreasing with the
+    plane distance and with the 4th power of the normals' cosine to MIN_WEIGHT; MIN_WEIGHT on other bodies, 0 on background."""
     segment = record_segment(record)
     if int(segment) == Segment.NOTHING:
         return 0.0
