@@ -17,7 +17,9 @@ ROUNDING = 1.0 / (255.0 * 12.0**0.5)
 DEPTH_TOLERANCE = 0.1
 """Largest deviation of depth that agrees, as a fraction of the object's diameter (Hinterstoisser et al., ACCV 2012)."""
 _LEVELS = 255.0
+"""Largest value of 8 bits."""
 _DETAIL, _LAB = 2, 3
+"""Columns of detail, and of the first of three CIELAB coordinates, in features."""
 
 
 class Appearance(NamedTuple):

@@ -55,6 +55,7 @@ _DEEP = "images of 16 bits a channel are taken as sRGB over their whole range; t
 _WIDER = 257
 """Largest value of 16 bits, as a multiple of that of 8."""
 _DIGITS = 12
+"""Hexadecimal digits of the hash in the name of the hidden folder."""
 
 
 class ImageRecord(msgspec.Struct):
