@@ -201,6 +201,36 @@ def flag_lost_kernel(
         lost_inout[world] = lost_inout[world] | lost
 
 
+@wp.kernel
+def set_gaps_kernel(
+    # Scene:
+    least: float,
+    most: float,
+    duration: float,
+    shape_body: wp.array[int],  # (shape), -1: static
+    shape_transform: wp.array[wp.transform],  # (shape)
+    shape_radius: wp.array[float],  # (shape) [m], about the shape's origin
+    body_com: wp.array[wp.vec3],  # (body) [m]
+    # In:
+    body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
+    # Out:
+    gap_out: wp.array[float],  # (shape) [m]
+):
+    """Speculative contact margins: `gap_out` receives `least`, and the bound (|v| + |ω| r) Δt on the path of the shape's points in a
+    substep of the given duration [s], but `most` at most. Launched over shape.
+
+    Two shapes have contacts up to the sum of their margins, so before they can touch. Contacts beyond that carry no impulse, but each is a
+    constraint row, and those of one body are solved one after the other.
+    """
+    shape = wp.tid()
+    body = shape_body[shape]
+    gap = least
+    if body >= 0:
+        radius = wp.length(wp.transform_get_translation(shape_transform[shape]) - body_com[body]) + shape_radius[shape]
+        gap += duration * (wp.length(wp.spatial_top(body_qd[body])) + wp.length(wp.spatial_bottom(body_qd[body])) * radius)
+    gap_out[shape] = wp.min(gap, most)
+
+
 @wp.func
 def shape_pose(collides: bool) -> wp.transform:
     """Local pose of a collision shape that can be disabled: identity, or far above, where it touches nothing.

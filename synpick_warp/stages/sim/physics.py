@@ -27,6 +27,8 @@ from synpick_warp.system.hardware.cores import is_only_launcher
 ENDED = object()
 # Contacts with a larger gap get no constraint rows [m]. The collision pipeline finds none that far apart: a hook disables a contact so.
 CONTACT_GAP = 0.1
+# Contact margin of a shape at rest [m]: far above the depth of contacts at rest, 0.1 mm, and what gravity adds in a substep.
+REST_GAP = 5e-4
 # Distance to a joint limit from which its constraint row is active [rad].
 JOINT_LIMIT_GAP = 0.2
 # Fraction of its speed limit from which a body has velocity limit rows. Six idle rows for each body at all times would take a third
@@ -221,6 +223,13 @@ class Physics:
             device=self.device,
         )
 
+    def _set_gaps(self, state: newton.State) -> None:
+        """Set the contact margins of all shapes by the speeds of their bodies."""
+        physics, model = self.settings, self.model
+        margins = [min(REST_GAP, physics.gap), physics.gap, physics.step / physics.substeps]
+        inputs = [*margins, model.shape_body, model.shape_transform, model.shape_collision_radius, model.body_com, state.body_qd]
+        wp.launch(rest.set_gaps_kernel, dim=model.shape_count, inputs=inputs, outputs=[model.shape_gap], device=self.device)
+
     def _run_substeps(
         self,
         before_step: Callable[[newton.State], None],
@@ -238,6 +247,7 @@ class Physics:
                     if watcher is not None:
                         watcher.begin_step()
                     before_step(current)
+                self._set_gaps(current)
                 self.pipeline.collide(current, self.contacts)
                 self.flag_lost()
                 if self.sleepers is not None:
