@@ -65,7 +65,7 @@ COUNTS = {
     "seeds": (3, "trainings, each with piles of its own"),
     "worlds": (512, "worlds simulated in parallel"),
     "capacity": (24_000, "views in the pool, at most"),
-    "batch": (128, "views of a batch"),
+    "batch": (48, "views of a batch"),
 }
 """Options that are integers above 0: default and meaning."""
 OWN = {
