@@ -166,12 +166,12 @@ class Physics:
         "for three ticks are not simulated until one is touched, and lack contact forces in records.",
     )
     friction: Annotated[float, "[0, 10]"] = setting(0.5, "Coulomb friction coefficient of every shape.")
-    gap: Annotated[float, "[0, 0.1] m"] = setting(4e-3, "Largest contact margin of a shape; at rest it is 0.5 mm, and grows with speed. Two shapes have contacts below the sum of theirs.")
+    gap: Annotated[float, "[0, 0.1] m"] = setting(4e-3, "Largest contact margin of a fast shape, 0.5 mm at rest: contacts exist below the sum of two.")
     angular_damping: Annotated[float, "[0, 1e3] 1/s"] = setting(0.05, "Angular damping of the objects (PhysX's default).")
     max_speed: Annotated[float, "(0, 100] m/s"] = setting(
         4.0, "Speed limit of the objects; above twice the gap per substep they may tunnel."
     )
-    contacts_per_world: Annotated[int, f"[16, {INT32_MAX}]"] = setting(512, "Contact capacity per world; about 140 contacts are usual.")
+    contacts_per_world: Annotated[int, f"[16, {INT32_MAX}]"] = setting(512, "Contact capacity per world; about 70 are usual.")
     pairs_per_world: Annotated[int, f"[16, {INT32_MAX}]"] = setting(1024, "Broad-phase pair capacity per world.")
     rows_per_world: Annotated[int, f"[48, {INT32_MAX}]"] = setting(1536, "Capacity for the objects' contact constraint rows per world.")
     gripper_rows_per_world: Annotated[int, f"[48, {INT32_MAX}]"] = setting(256, "Capacity for the gripper's constraint rows per world.")
