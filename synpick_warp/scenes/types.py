@@ -38,7 +38,22 @@ class Glass:
     """Way of the light inside [m]; 0: thin-walled, light is not bent."""
 
 
+@dataclass(frozen=True)
+class Finish:
+    """Clear coat and anisotropy of a material, as in KHR_materials_clearcoat and KHR_materials_anisotropy of glTF."""
+
+    clearcoat: float = 0.0
+    """Factor on the coat, 0 (none) to 1."""
+    clearcoat_roughness: float = 0.0
+    """Perceptual roughness of the coat, 0 to 1."""
+    anisotropy: float = 0.0
+    """Strength by which highlights are stretched, 0 to 1."""
+    rotation: float = 0.0
+    """Direction in which they are, from growing u towards growing v [rad]."""
+
+
 OPAQUE = Glass()
+PLAIN = Finish()
 BLACK = (0.0, 0.0, 0.0)
 
 MAP_CENTER = 128
@@ -68,6 +83,8 @@ class Material:
     """Emitted light, linear; 1 is the white of a picture, under any environment map."""
     glow: np.ndarray | None = field(default=None, hash=False)
     """Emission texture of the texture's size (H, W, 3) uint8, sRGB, a factor on `emission`. None: it is the same everywhere."""
+    finish: Finish = field(default=PLAIN, hash=False)
+    """Clear coat and anisotropy."""
 
     @property
     def map_names(self) -> frozenset[str]:

@@ -14,8 +14,8 @@ from synpick_warp.configs.fields import settings_of
 from synpick_warp.kernels.distributions import LookDistribution, LookTable
 from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene, RandomizedScene
-from synpick_warp.kernels.render.lighting.surfaces import RandomizedSurfaces, Surfaces
+from synpick_warp.kernels.render.lighting.paths.tracing import FinishedScene, RandomizedScene
+from synpick_warp.kernels.render.lighting.surfaces import FinishedSurfaces, RandomizedSurfaces, Surfaces
 from synpick_warp.kernels.render.lighting.wear import NOISE_SIZE, make_noise_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
@@ -58,7 +58,7 @@ SETTINGS = {
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels", "maps")
 """Arrays of `Surfaces` with a row for each material, of every scene ..."""
-_DRAWN = ("recolor", "repeats", "wear", "pattern", "glass", "label", "emission")
+_DRAWN = ("recolor", "repeats", "wear", "pattern", "glass", "label", "emission", "finish")
 _TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, *_DRAWN)}
 _MATERIALS = StructArrays(
     RandomizedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
@@ -134,6 +134,14 @@ def make_noise(device: wp.Device) -> wp.array:
     return noise
 
 
+def recast(source: Any, kind: Any, **given: Any) -> Any:
+    """Struct of another kind with the members of a struct, but for those given."""
+    result = kind()
+    for name in kind.vars:
+        setattr(result, name, given[name] if name in given else getattr(source, name))
+    return result
+
+
 class Dresser:
     """Sampler of the materials of each batch of views. Owns a scene with space for them.
 
@@ -162,6 +170,8 @@ class Dresser:
         if scene.emission is not None:
             wp.copy(surfaces.emission, scene.emission[0], count=scene.emission[0].size)
             surfaces.glow = scene.emission[1]
+        if scene.finish is not None:
+            wp.copy(surfaces.finish, scene.finish, count=scene.finish.size)
         surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
         is_worn = any(getattr(looks.randomize, name).kind != OFF for name in WEAR)
         surfaces.noise = make_noise(scene.device) if is_worn else wp.zeros((1, 1, 1), dtype=wp.uint32, device=scene.device)
@@ -171,9 +181,8 @@ class Dresser:
             surfaces.repeats.fill_(1.0)
             rows = np.tile(scene.props.first + np.arange(scene.prop_count), (views, 1))
             self._props = slice(instances - scene.prop_count, instances), wp.array(rows, dtype=wp.int32, device=scene.device)
-        paths = RandomizedScene()
-        for name in PathScene.vars:
-            setattr(paths, name, surfaces if name == "surfaces" else getattr(scene.paths, name))
+        shown = surfaces if scene.finish is None else recast(surfaces, FinishedSurfaces)
+        paths = recast(scene.paths, RandomizedScene if scene.finish is None else FinishedScene, surfaces=shown)
         self.scene = replace(scene, surfaces=surfaces, paths=paths)
 
     def dress(self, snapshot: Snapshot, views: Any, bodies: Any) -> None:

@@ -1,6 +1,6 @@
 """Constant device data of the renderer: meshes, surfaces, cameras, lights. Shared by all worlds."""
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import cv2
@@ -40,7 +40,7 @@ from synpick_warp.scenes.bins import TABLE_ROUGHNESS
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.modelling import project_from_box
-from synpick_warp.scenes.types import MAP_CENTER, OPAQUE, Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
+from synpick_warp.scenes.types import MAP_CENTER, OPAQUE, PLAIN, Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.light_tables import (
     EnvironmentTables,
@@ -92,11 +92,15 @@ class RenderScene:
     """(material): transmission, index of refraction, thickness [m]; None: all of them are opaque, and no episode draws another."""
     emission: tuple[wp.array, wp.array] | None = None
     """Arrays `emission` and `glow` of the struct `RandomizedSurfaces`; None if no material emits light."""
+    finish: wp.array | None = None
+    """Array `finish` of the struct `RandomizedSurfaces`; None: no material has a clear coat or is anisotropic."""
 
     @property
     def has_details(self) -> bool:
         """Whether a material has normal, roughness or metallic maps, or some are transparent or emit light."""
-        return self.surfaces is not None and (self.surfaces.detail.size > 1 or self.is_transparent or self.emission is not None)
+        return self.surfaces is not None and (
+            self.surfaces.detail.size > 1 or self.is_transparent or self.emission is not None or self.finish is not None
+        )
 
     @property
     def is_transparent(self) -> bool:
@@ -316,6 +320,13 @@ def build_emission(materials: list[Material], surfaces: Any, exposure: float) ->
     return wp.array(emission, dtype=wp.vec3, device=device), wp.array(glow, dtype=wp.uint32, device=device)
 
 
+def build_finish(materials: list[Material], device: wp.Device) -> wp.array | None:
+    """Clear coat and anisotropy of the materials (material) as of `RenderScene.finish`."""
+    if all(each.finish == PLAIN for each in materials):
+        return None
+    return wp.array([astuple(each.finish) for each in materials], dtype=wp.vec4, device=device)
+
+
 def with_cameras(scene: RenderScene, cameras: tuple[Camera, ...]) -> RenderScene:
     """The same scene with other cameras, of one image size."""
     grid = build_grid(*cameras[0].resolution)
@@ -465,6 +476,7 @@ def build_render_scene(
         suction_maps=build_suction_scene(catalog, cup_radius, device),
         glass=build_glass(materials, len(catalog.bodies), looks, device),
         emission=build_emission(materials, paths.surfaces, settings.exposure),
+        finish=build_finish(materials, device),
         props=build_props(catalog, device),
         prop_count=len(catalog.props),
     )

@@ -200,4 +200,5 @@ def test_plain_structs_have_nothing_of_looks():
         "label",
         "emission",
         "glow",
+        "finish",
     }

@@ -11,7 +11,7 @@ from synpick_warp.kernels.render.images.depth_sensor import measured_pixel
 from synpick_warp.kernels.render.images.infrared import eye_hit, infrared_byte, infrared_light
 from synpick_warp.kernels.render.images.layers import LayerScene
 from synpick_warp.kernels.render.lighting.color import luminance
-from synpick_warp.kernels.render.lighting.paths.tracing import RandomizedScene
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.transparency import passing_light
 from synpick_warp.kernels.render.visibility.camera import camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, GBuffer, ViewBodies, body_of, read_hit
@@ -43,10 +43,10 @@ def patch_shares(key: wp.uint64, place: wp.vec3) -> wp.vec2:
     return wp.vec2(0.5 + 0.5 * wp.erf(total[0] / scale), 0.5 + 0.5 * wp.erf(total[1] / scale))
 
 
-@kernel_of_views
+@kernel_of_views(drawn=True)
 def measure_behind_kernel(
     # Scene:
-    scene: RandomizedScene,
+    scene: AnyScene,
     layer: LayerScene,
     # In:
     shot: AnyShot,
@@ -89,10 +89,10 @@ def measure_behind_kernel(
     image_inout[view, row, column] = wp.uint16(wp.rint(counts))
 
 
-@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
+@kernel_of_views(drawn=True, cuda_max_registers=RAY_REGISTERS)
 def see_through_kernel(
     # Scene:
-    scene: RandomizedScene,
+    scene: AnyScene,
     # In:
     sensor: SensorParameters,
     shot: AnyShot,

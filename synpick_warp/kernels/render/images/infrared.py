@@ -8,12 +8,11 @@ import warp as wp
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters, shot_key
 from synpick_warp.kernels.render.images.layers import seen_surface
-from synpick_warp.kernels.render.lighting.brdf import Brdf, evaluate_brdf, make_brdf, widen_roughness
+from synpick_warp.kernels.render.lighting.brdf import AnyBrdf, evaluate_brdf, widen_roughness
 from synpick_warp.kernels.render.lighting.color import luminance
 from synpick_warp.kernels.render.lighting.environment import environment_radiance, rotate_z
-from synpick_warp.kernels.render.lighting.materials import material_at, wear_at
+from synpick_warp.kernels.render.lighting.materials import brdf_of, material_at, wear_at
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
-from synpick_warp.kernels.render.lighting.surfaces import Surface
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked, trace_ray
 from synpick_warp.kernels.render.visibility.camera import AnyViews, camera_ray, in_image, tile_pixel
@@ -67,21 +66,21 @@ def eye_hit(
 
 @wp.func
 def dot_light(
-    scene: AnyScene, sensor: SensorParameters, bodies: ViewBodies, views: AnyViews, view: int, point: wp.vec3, surface: Surface, brdf: Brdf
+    scene: AnyScene, sensor: SensorParameters, bodies: ViewBodies, views: AnyViews, view: int, point: wp.vec3, face: wp.vec3, brdf: AnyBrdf
 ) -> float:
     """Brightness of projected dots at a surface point, `point` in the camera's axes [m]: that of a white surface is the pattern's by
-    cosine / z², in the open."""
+    cosine / z², in the open. `face`: geometric normal."""
     cameras = views.cameras
     from_projector = point - wp.vec3(sensor.projector, 0.0, 0.0)
     scale = cameras.intrinsics[view][0] / from_projector[2]
     light = sensor.dot_brightness / (from_projector[2] * from_projector[2])
     light *= dot_pattern(scale * from_projector[0], scale * from_projector[1], sensor.dot_spacing)
     to_projector = -wp.normalize(cameras.to_world[view] * from_projector)
-    if light < LEAST_LIGHT or wp.dot(surface.face_normal, to_projector) <= 0.0:
+    if light < LEAST_LIGHT or wp.dot(face, to_projector) <= 0.0:
         return 0.0
     value = evaluate_brdf(scene.surfaces.albedo, brdf, to_projector)
     reflected = wp.PI * light * luminance(value.diffuse * brdf.diffuse + value.specular)
-    start = wp.vec3(cameras.center[view]) + cameras.to_world[view] * point + RAY_OFFSET * surface.face_normal
+    start = wp.vec3(cameras.center[view]) + cameras.to_world[view] * point + RAY_OFFSET * face
     reach = wp.length(from_projector)
     if reflected < LEAST_LIGHT or is_blocked(scene.meshes, scene.table, bodies, view, views.instances, start, to_projector, reach):
         return 0.0
@@ -116,10 +115,10 @@ def infrared_light(
         surface = seen_surface(scene, shot, bodies, view, hit, point, outgoing)
         material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface, False))
         roughness = widen_roughness(material.roughness, surface.normal_spread)
-        brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
+        brdf = brdf_of(scene.surfaces, surface, material, roughness, outgoing, 0.0)
         ambient = unoccluded_light(scene.lights, which, yaw, brdf)
         radiance = luminance(wp.cw_mul(brdf.diffuse, ambient.diffuse) + ambient.specular)
-        dots = dot_light(scene, sensor, blockers, shot.views, view, point, surface, brdf)
+        dots = dot_light(scene, sensor, blockers, shot.views, view, point, surface.face_normal, brdf)
     return wp.vec2(sensor.ambient * scene.lights.exposure[which] * radiance, dots)
 
 

@@ -7,8 +7,8 @@ from synpick_warp.kernels.render.images.antialias import resolve_radiance
 from synpick_warp.kernels.render.lighting.environment import environment_radiance, rotate_z
 from synpick_warp.kernels.render.lighting.paths.tracing import (
     TERMINATED,
+    AnyScene,
     PathRules,
-    RandomizedScene,
     extend_path,
     init_path,
     make_vertex,
@@ -26,10 +26,10 @@ from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 wp.set_module_options({"enable_backward": False})
 
 
-@kernel_of_views
+@kernel_of_views(drawn=True)
 def add_scene_behind_kernel(
     # Scene:
-    scene: RandomizedScene,
+    scene: AnyScene,
     # In:
     shot: AnyShot,
     behind: ShadedImage,
@@ -61,10 +61,8 @@ def add_scene_behind_kernel(
     image_inout.radiance[view, row, column] += wp.cw_mul(light.weight, resolve_radiance(behind, view, at_row, at_column))
 
 
-@kernel_of_views
-def trace_scene_behind_kernel(
-    scene: RandomizedScene, shot: AnyShot, opaque: ViewBodies, rules: PathRules, first: int, image_inout: ShadedImage
-):
+@kernel_of_views(drawn=True)
+def trace_scene_behind_kernel(scene: AnyScene, shot: AnyShot, opaque: ViewBodies, rules: PathRules, first: int, image_inout: ShadedImage):
     """Path-traced transmission: camera paths that meet a transparent body continue behind it, among `opaque` bodies alone, and their mean
     radiance is added to the image. Random numbers are those of `trace_paths_kernel`. Launched over view, pixel (tile order, from flat index
     `first` on)."""

@@ -5,7 +5,7 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.environment import lamp_center, lamp_irradiance, sh_irradiance
 from synpick_warp.kernels.render.lighting.materials import map_table, sample_base_color
-from synpick_warp.kernels.render.lighting.paths.tracing import RandomizedScene
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.surfaces import Surface
 from synpick_warp.kernels.render.visibility.camera import camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, ShadedImage
@@ -18,7 +18,7 @@ HORIZON = wp.constant(0.02)
 
 
 @wp.func
-def floor_radiance(scene: RandomizedScene, drop: float, shot: AnyShot, view: int, light: int, direction: wp.vec3) -> wp.vec3:
+def floor_radiance(scene: AnyScene, drop: float, shot: AnyShot, view: int, light: int, direction: wp.vec3) -> wp.vec3:
     """Radiance of the floor, `drop` [m] below the table, along a unit direction in the world, which points down: diffuse, in unoccluded
     light."""
     cameras = shot.views.cameras
@@ -34,8 +34,8 @@ def floor_radiance(scene: RandomizedScene, drop: float, shot: AnyShot, view: int
     return wp.cw_mul(sample_base_color(scene.surfaces, surface), irradiance) / wp.PI
 
 
-@kernel_of_views
-def shade_floor_kernel(scene: RandomizedScene, drop: float, shot: AnyShot, first: int, image_inout: ShadedImage):
+@kernel_of_views(drawn=True)
+def shade_floor_kernel(scene: AnyScene, drop: float, shot: AnyShot, first: int, image_inout: ShadedImage):
     """Shade the floor, a ground plane, where a camera ray points down and hits nothing else. It has no depth and lights nothing.
 
     The last material of each view is that of the floor, which is `drop` [m] below the table. Launched over view, pixel (tile order, from

@@ -12,6 +12,8 @@ This blends a metal and a dielectric by `metallic`, as glTF does. Each term is r
 `AlbedoTables` holds a and b.
 """
 
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.sampling import rotate_to_axis, sobol_point
@@ -81,6 +83,10 @@ class Brdf:
     """Probability of sampling the GGX lobe; else the cosine lobe is sampled."""
 
 
+AnyBrdf = Any
+"""`Brdf`, or `FinishedBrdf` of `finish`: functions are compiled for each."""
+
+
 @wp.func
 def directional_albedo(tables: AlbedoTables, roughness: float, cosine: float) -> wp.vec2:
     """Directional albedo at a roughness and a cosine, bilinear in roughness and √cosine."""
@@ -117,13 +123,13 @@ def multi_scatter_fresnel(mean_albedo: float, reflectance: float) -> float:
 
 
 @wp.func
-def coat_albedo(brdf: Brdf, albedo: wp.vec2) -> float:
+def coat_albedo(brdf: AnyBrdf, albedo: wp.vec2) -> float:
     """E_d: albedo of all specular reflection of a dielectric (the coat over the diffuse lobe), for the table's entry `albedo`."""
     return albedo[0] * DIELECTRIC_F0 + albedo[1] + (1.0 - albedo[0] - albedo[1]) * brdf.coat_multi_scatter
 
 
 @wp.func
-def specular_albedo(brdf: Brdf) -> wp.vec3:
+def specular_albedo(brdf: AnyBrdf) -> wp.vec3:
     """Directional albedo of all specular reflection, single and multiple scattering: its response to uniform light."""
     single = brdf.albedo[0] * brdf.f0 + wp.vec3(brdf.albedo[1], brdf.albedo[1], brdf.albedo[1])
     return single + (1.0 - brdf.albedo[0] - brdf.albedo[1]) * brdf.multi_scatter
@@ -152,9 +158,10 @@ def widen_roughness(roughness: float, normal_spread: float) -> float:
 
 
 @wp.func
-def make_brdf(tables: AlbedoTables, base: wp.vec3, metallic: float, roughness: float, normal: wp.vec3, outgoing: wp.vec3) -> Brdf:
-    """Build the BRDF of a surface with linear base colour `base` for the view direction `outgoing`; `normal` points to the same side."""
-    brdf = Brdf()
+def make_brdf(new: AnyBrdf, tables: AlbedoTables, base: wp.vec3, metallic: float, roughness: float, normal: wp.vec3, outgoing: wp.vec3):
+    """Build the BRDF of a surface with linear base colour `base` for the view direction `outgoing`; `normal` points to the same side.
+    `new`: the struct whose members are set."""
+    brdf = new
     brdf.normal = bend_normal(normal, outgoing)
     brdf.tangent = rotate_to_axis(brdf.normal, wp.vec3(1.0, 0.0, 0.0))
     brdf.bitangent = rotate_to_axis(brdf.normal, wp.vec3(0.0, 1.0, 0.0))
@@ -180,7 +187,7 @@ def make_brdf(tables: AlbedoTables, base: wp.vec3, metallic: float, roughness: f
 
 
 @wp.func
-def to_local(brdf: Brdf, direction: wp.vec3) -> wp.vec3:
+def to_local(brdf: AnyBrdf, direction: wp.vec3) -> wp.vec3:
     """Transform a world direction into the shading frame, whose z is the normal."""
     return wp.vec3(wp.dot(direction, brdf.tangent), wp.dot(direction, brdf.bitangent), wp.dot(direction, brdf.normal))
 
@@ -275,7 +282,7 @@ class Angles:
 
 
 @wp.func
-def measure_angles(brdf: Brdf, incoming: wp.vec3) -> Angles:
+def measure_angles(brdf: AnyBrdf, incoming: wp.vec3) -> Angles:
     """Cosines between light direction `incoming`, view direction, half vector and normal."""
     angles = Angles()
     angles.incoming = wp.dot(incoming, brdf.normal)
@@ -301,7 +308,7 @@ class ViewFactors:
 
 
 @wp.func
-def view_factors(brdf: Brdf) -> ViewFactors:
+def view_factors(brdf: AnyBrdf) -> ViewFactors:
     """Factors of the BRDF that several lights share: masking, multiple scattering and diffuse term of its view direction."""
     factors = ViewFactors()
     factors.smith = smith_term(wp.dot(brdf.outgoing, brdf.normal), brdf.alpha)
@@ -312,7 +319,7 @@ def view_factors(brdf: Brdf) -> ViewFactors:
 
 
 @wp.func
-def evaluate_lobes(tables: AlbedoTables, brdf: Brdf, view: ViewFactors, angles: Angles, distribution: float) -> BrdfValue:
+def evaluate_lobes(tables: AlbedoTables, brdf: AnyBrdf, view: ViewFactors, angles: Angles, distribution: float) -> BrdfValue:
     """Both lobes for light and view directions at these `angles`; `distribution` is D at the half vector."""
     value = BrdfValue()
     one = wp.vec3(1.0, 1.0, 1.0)
@@ -335,6 +342,14 @@ def evaluate_brdf(tables: AlbedoTables, brdf: Brdf, incoming: wp.vec3) -> BrdfVa
 
 
 @wp.func
+def disc_slopes(angles: Angles, radius: float) -> float:
+    """Radius of the disc of half-vector slopes of a disc light: a half vector rotates by half the angle in the plane of both directions, by
+    more across it; slopes change by more than angles do."""
+    cube = angles.half_way * angles.half_way * angles.half_way
+    return 0.5 * radius / wp.sqrt(wp.max(angles.difference * cube, MIN_COSINE))
+
+
+@wp.func
 def evaluate_disc(tables: AlbedoTables, brdf: Brdf, view: ViewFactors, center: wp.vec3, radius: float) -> wp.vec3:
     """Evaluate the BRDF times cosine, averaged over a disc light (a lamp) about `center`.
 
@@ -345,10 +360,7 @@ def evaluate_disc(tables: AlbedoTables, brdf: Brdf, view: ViewFactors, center: w
     angles = measure_angles(brdf, center)
     if angles.incoming <= 0.0 or angles.outgoing <= 0.0:
         return wp.vec3(0.0, 0.0, 0.0)
-    # A half vector rotates by half the angle in the plane of both directions, by more across it; slopes change by more than angles do.
-    cube = angles.half_way * angles.half_way * angles.half_way
-    slopes = 0.5 * radius / wp.sqrt(wp.max(angles.difference * cube, MIN_COSINE))
-    distribution = ggx_disc_distribution(angles.half_way, angles.squared_sine, brdf.alpha, slopes)
+    distribution = ggx_disc_distribution(angles.half_way, angles.squared_sine, brdf.alpha, disc_slopes(angles, radius))
     value = evaluate_lobes(tables, brdf, view, angles, distribution)
     return value.specular + value.diffuse * brdf.diffuse
 

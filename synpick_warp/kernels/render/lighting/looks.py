@@ -182,6 +182,7 @@ def dress_bodies_kernel(
         surfaces_inout.label[row] = place_label(meshes, base, surfaces_inout.pattern[row], material.label, part == LookPart.BIN)
     surfaces_inout.maps[row] = material.maps
     surfaces_inout.emission[row] = wp.where(material.texture == base, surfaces_inout.emission[base], wp.vec3(0.0, 0.0, 0.0))
+    surfaces_inout.finish[row] = surfaces_inout.finish[base]
     surfaces_inout.texture_size[row] = surfaces_inout.texture_size[material.texture]
     surfaces_inout.texture_levels[row] = surfaces_inout.texture_levels[material.texture]
     for level in range(surfaces_inout.first_texel.shape[1]):

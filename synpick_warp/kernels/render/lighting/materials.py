@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from synpick_warp.kernels.render.lighting.brdf import MIN_ALPHA, Brdf, make_brdf
+from synpick_warp.kernels.render.lighting.finish import FinishedBrdf, finish_brdf
 from synpick_warp.kernels.render.lighting.labels import LABEL_ROUGHNESS, label_coordinates, label_reflectance
 from synpick_warp.kernels.render.lighting.surfaces import (
     GLOW_MAP,
@@ -23,7 +25,7 @@ from synpick_warp.kernels.render.lighting.surfaces import (
     TEXEL_WIDTH,
     TRIANGLE_RECORDS,
     AnySurfaces,
-    RandomizedSurfaces,
+    FinishedSurfaces,
     Surface,
     SurfaceMaterial,
     Surfaces,
@@ -50,7 +52,7 @@ def material_of(surfaces: Surfaces, view: int, body: int, mesh: int) -> int:
 
 
 @wp.func
-def material_of(surfaces: RandomizedSurfaces, view: int, body: int, mesh: int) -> int:  # noqa: F811
+def material_of(surfaces: AnySurfaces, view: int, body: int, mesh: int) -> int:  # noqa: F811
     """Row of the material of a body of a view, which its episode has drawn."""
     return surfaces.row[view, body]
 
@@ -74,7 +76,7 @@ def map_table(surfaces: Surfaces, surface: Surface, position: wp.vec3, view_dire
 
 @wp.func
 def map_table(  # noqa: F811
-    surfaces: RandomizedSurfaces, surface: Surface, position: wp.vec3, view_direction: wp.vec3, pixel_width: float
+    surfaces: AnySurfaces, surface: Surface, position: wp.vec3, view_direction: wp.vec3, pixel_width: float
 ) -> Surface:
     """The table's shading data with texture coordinates."""
     result = surface
@@ -92,12 +94,24 @@ def repeat_texture(surfaces: Surfaces, surface: Surface) -> Surface:
 
 
 @wp.func
-def repeat_texture(surfaces: RandomizedSurfaces, surface: Surface) -> Surface:  # noqa: F811
+def repeat_texture(surfaces: AnySurfaces, surface: Surface) -> Surface:  # noqa: F811
     """Shading data with its texture coordinates, and their footprint, scaled as the material says."""
     result = surface
     result.uv = surfaces.repeats[surface.row] * surface.uv
     result.uv_footprint = surfaces.repeats[surface.row] * surface.uv_footprint
     return result
+
+
+@wp.func
+def has_tangent(surfaces: AnySurfaces, row: int) -> bool:
+    """Whether a material needs tangents: it has a normal map, or is anisotropic."""
+    return (surfaces.maps[row] & NORMAL_MAP) != 0
+
+
+@wp.func
+def has_tangent(surfaces: FinishedSurfaces, row: int) -> bool:  # noqa: F811
+    """Whether a material needs tangents."""
+    return (surfaces.maps[row] & NORMAL_MAP) != 0 or surfaces.finish[row][2] > 0.0
 
 
 @wp.func
@@ -118,7 +132,7 @@ def place_details(
 @wp.func
 def place_details(  # noqa: F811
     meshes: Meshes,
-    surfaces: RandomizedSurfaces,
+    surfaces: AnySurfaces,
     surface: Surface,
     mesh: int,
     triangle: int,
@@ -129,7 +143,7 @@ def place_details(  # noqa: F811
     """Shading data with tangent, place and label. The tangent is that of the triangle: the edge along which only u grows."""
     result = surface
     is_worn = has_wear(surfaces.wear[surface.row])
-    is_bumpy = (surfaces.maps[surface.row] & NORMAL_MAP) != 0
+    is_bumpy = has_tangent(surfaces, surface.row)
     label = surfaces.label[surface.row]
     is_labelled = wp.length_sq(label.normal) > 0.0
     if not is_worn and not is_bumpy and not is_labelled:
@@ -266,7 +280,7 @@ def sample_base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
 
 
 @wp.func
-def sample_base_color(surfaces: RandomizedSurfaces, surface: Surface) -> wp.vec3:  # noqa: F811
+def sample_base_color(surfaces: AnySurfaces, surface: Surface) -> wp.vec3:  # noqa: F811
     """Linear base colour: material colour times texture, changed by the material's matrix."""
     turned = surfaces.recolor[surface.row] * sample_texture(surfaces, surface)
     return wp.vec3(wp.clamp(turned[0], 0.0, 1.0), wp.clamp(turned[1], 0.0, 1.0), wp.clamp(turned[2], 0.0, 1.0))
@@ -295,7 +309,7 @@ def sample_texture(surfaces: AnySurfaces, surface: Surface) -> wp.vec3:
 
 
 @wp.func
-def decode_detail(surfaces: RandomizedSurfaces, index: int) -> wp.vec4:
+def decode_detail(surfaces: AnySurfaces, index: int) -> wp.vec4:
     """Unpack a texel of the maps: x and y of the normal, roughness, metallic."""
     texel = int(surfaces.detail[index])
     x = float((texel & TEXEL_MASK) - NORMAL_ZERO)
@@ -310,7 +324,7 @@ def decode_detail(surfaces: RandomizedSurfaces, index: int) -> wp.vec4:
 
 
 @wp.func
-def sample_details(surfaces: RandomizedSurfaces, surface: Surface) -> wp.vec4:
+def sample_details(surfaces: AnySurfaces, surface: Surface) -> wp.vec4:
     """Trilinear look-up of the maps: x and y of the normal in the tangent frame, roughness, metallic."""
     level = mip_level(surfaces, surface)
     total = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -338,13 +352,13 @@ def bump_normal(surface: Surface, x: float, y: float) -> wp.vec3:
 
 
 @wp.func
-def texel_opacity(surfaces: RandomizedSurfaces, index: int) -> float:
+def texel_opacity(surfaces: AnySurfaces, index: int) -> float:
     """Opacity of a texel, 0 to 1."""
     return float((surfaces.texel[index] >> wp.uint32(OPACITY_SHIFT)) & wp.uint32(OPACITY_MASK)) / float(OPACITY_MASK)
 
 
 @wp.func
-def transmission_at(surfaces: RandomizedSurfaces, surface: Surface) -> float:
+def transmission_at(surfaces: AnySurfaces, surface: Surface) -> float:
     """Transmission at a hit: that of its row, less what its texels lack, by a bilinear look-up in the nearest mip level."""
     transmission = surfaces.glass[surface.row][0]
     if transmission == 0.0 or surfaces.texture_size[surface.row][0] == 0:
@@ -356,7 +370,7 @@ def transmission_at(surfaces: RandomizedSurfaces, surface: Surface) -> float:
 
 
 @wp.func
-def emission_at(surfaces: RandomizedSurfaces, surface: Surface) -> wp.vec3:
+def emission_at(surfaces: AnySurfaces, surface: Surface) -> wp.vec3:
     """Emission at a hit: that of its row, times its texture by a bilinear look-up in the nearest mip level."""
     emission = surfaces.emission[surface.row]
     if wp.max(emission) == 0.0 or (surfaces.maps[surface.row] & GLOW_MAP) == 0:
@@ -377,7 +391,7 @@ def wear_at(surfaces: Surfaces, surface: Surface, is_mean: bool) -> Wear:
 
 
 @wp.func
-def wear_at(surfaces: RandomizedSurfaces, surface: Surface, is_mean: bool) -> Wear:  # noqa: F811
+def wear_at(surfaces: AnySurfaces, surface: Surface, is_mean: bool) -> Wear:  # noqa: F811
     """Wear of a surface in a pixel, by the amounts of its row, or its mean over the whole surface."""
     amount = surfaces.wear[surface.row]
     if is_mean:
@@ -399,7 +413,7 @@ def material_at(surfaces: Surfaces, surface: Surface, wear: Wear) -> SurfaceMate
 
 
 @wp.func
-def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> SurfaceMaterial:  # noqa: F811
+def material_at(surfaces: AnySurfaces, surface: Surface, wear: Wear) -> SurfaceMaterial:  # noqa: F811
     """Material at a hit, by its row or maps, changed by `wear`, which all samples of a pixel share. Labels are opaque, and so is metal."""
     result = SurfaceMaterial()
     result.transmission = transmission_at(surfaces, surface)
@@ -431,3 +445,28 @@ def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> S
         result.metallic = worn.metallic
         result.roughness = worn.roughness
     return result
+
+
+@wp.func
+def brdf_of(surfaces: AnySurfaces, surface: Surface, material: SurfaceMaterial, roughness: float, outgoing: wp.vec3, least: float) -> Brdf:
+    """BRDF of a surface for the view direction `outgoing`. `roughness`: that of the material, increased; `least`: smallest of a coat."""
+    return make_brdf(Brdf(), surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
+
+
+@wp.func
+def brdf_of(  # noqa: F811
+    surfaces: FinishedSurfaces, surface: Surface, material: SurfaceMaterial, roughness: float, outgoing: wp.vec3, least: float
+) -> FinishedBrdf:
+    """BRDF of a surface with the finish of its row. The coat has the interpolated normal and is widened as the base; labels have none."""
+    finish = surfaces.finish[surface.row]
+    if surface.label[2] > 0.0:
+        finish = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    alpha = wp.clamp(roughness * roughness, MIN_ALPHA, 1.0)
+    widths = wp.vec2(alpha, alpha)
+    if wp.length_sq(wp.cross(wp.vec3(surface.tangent[0], surface.tangent[1], surface.tangent[2]), material.normal)) > 0.0:
+        widths[0] = wp.lerp(alpha, 1.0, finish[2] * finish[2])
+    mean = wp.sqrt(0.5 * (widths[0] + widths[1]))
+    brdf = make_brdf(FinishedBrdf(), surfaces.albedo, material.color, material.metallic, mean, material.normal, outgoing)
+    added = wp.max(wp.pow(roughness, 4.0) - wp.pow(material.roughness, 4.0), 0.0)
+    finish[1] = wp.max(wp.sqrt(wp.sqrt(wp.min(wp.pow(finish[1], 4.0) + added, 1.0))), least)
+    return finish_brdf(brdf, surfaces.albedo, widths, surface.normal, surface.tangent, finish)

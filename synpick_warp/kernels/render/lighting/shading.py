@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf, view_factors, widen_roughness
+from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, AnyBrdf, evaluate_disc, view_factors, widen_roughness
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.environment import (
     Lights,
@@ -20,7 +20,7 @@ from synpick_warp.kernels.render.lighting.environment import (
     rotate_z,
     unit_heading,
 )
-from synpick_warp.kernels.render.lighting.materials import interpolate_surface, make_table_surface, map_table, material_at, wear_at
+from synpick_warp.kernels.render.lighting.materials import brdf_of, interpolate_surface, make_table_surface, map_table, material_at, wear_at
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows
@@ -80,7 +80,7 @@ class PixelLight:
 
 @wp.func
 def lamp_light(
-    tables: AlbedoTables, lights: Lights, light: int, yaw: float, brdf: Brdf, face_normal: wp.vec3, visible: wp.uint64
+    tables: AlbedoTables, lights: Lights, light: int, yaw: float, brdf: AnyBrdf, face_normal: wp.vec3, visible: wp.uint64
 ) -> wp.vec3:
     """Radiance of the lamps' light that a surface reflects towards the camera; `visible` as in `PixelLight.lamps`. Lamps behind the
     triangle, whose geometric normal is `face_normal`, give no light, whatever the interpolated normal says."""
@@ -101,7 +101,7 @@ def lamp_light(
 
 @wp.func
 def shade_surface(
-    tables: AlbedoTables, lights: Lights, light: int, yaw: float, brdf: Brdf, face_normal: wp.vec3, ratios: Ratios, lamps: wp.uint64
+    tables: AlbedoTables, lights: Lights, light: int, yaw: float, brdf: AnyBrdf, face_normal: wp.vec3, ratios: Ratios, lamps: wp.uint64
 ) -> wp.vec3:
     """Radiance towards the camera: unoccluded light times its visibility `ratios`, indirect light, and that of the visible `lamps`."""
     unoccluded = unoccluded_light(lights, light, yaw, brdf)
@@ -132,7 +132,7 @@ def shade_point(scene: AnyScene, sky: Sky, surface: Surface, wear: Wear, outgoin
     """Radiance of a point of a surface towards the camera, the direction `outgoing`."""
     material = material_at(scene.surfaces, surface, wear)
     roughness = widen_roughness(material.roughness, surface.normal_spread)
-    brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
+    brdf = brdf_of(scene.surfaces, surface, material, roughness, outgoing, 0.0)
     lit = shade_surface(scene.surfaces.albedo, scene.lights, sky.light, sky.yaw, brdf, surface.face_normal, light.ratios, light.lamps)
     return add_emission(scene.surfaces, lit, material.emission, scene.lights.exposure[sky.light])
 

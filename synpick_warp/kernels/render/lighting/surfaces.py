@@ -87,6 +87,7 @@ RandomizedSurfaces = variant_of(
     label=wp.array[Label],
     emission=wp.array[wp.vec3],
     glow=wp.array[wp.uint32],
+    finish=wp.array[wp.vec4],
 )
 """Surfaces with maps, or whose materials each episode draws at random (`looks`): constant, but for the materials of views.
 
@@ -95,10 +96,12 @@ body's material (view, body, then the table and the floor), `recolor` the matrix
 clamped to 0..1, and `repeats` the factor on its texture coordinates; `wear` are the amounts of `lighting.wear`, whose noise is the
 table `noise`, in a part that the seed `pattern` draws; `glass` is transmission, index of refraction, and thickness [m]; `label` the place
 of the body's label, whose print has the same seed; `emission` is the light that it emits, in units of the white of a picture, and `glow`
-(texel) a factor on it, packed as `texel`."""
+(texel) a factor on it, packed as `texel`; `finish` are clearcoat, its roughness, anisotropy and its rotation [rad], which
+`FinishedSurfaces` alone have."""
+FinishedSurfaces = variant_of(RandomizedSurfaces, "FinishedSurfaces")
 AnySurfaces = Any
-"""`Surfaces`, or `RandomizedSurfaces`: functions are compiled for each; see `variants`."""
-VARIANTS["surfaces"] = Surfaces, RandomizedSurfaces
+"""`Surfaces`, `RandomizedSurfaces` or `FinishedSurfaces`: functions are compiled for each; see `variants`."""
+VARIANTS["surfaces"] = Surfaces, RandomizedSurfaces, FinishedSurfaces
 
 
 @wp.struct
@@ -146,6 +149,6 @@ def add_emission(surfaces: Surfaces, radiance: wp.vec3, emission: wp.vec3, expos
 
 
 @wp.func
-def add_emission(surfaces: RandomizedSurfaces, radiance: wp.vec3, emission: wp.vec3, exposure: float) -> wp.vec3:  # noqa: F811
+def add_emission(surfaces: AnySurfaces, radiance: wp.vec3, emission: wp.vec3, exposure: float) -> wp.vec3:  # noqa: F811
     """Radiance of a surface with what it emits: an emission of 1 is the white of a picture."""
     return radiance + emission / exposure

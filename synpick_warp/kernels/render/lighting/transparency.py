@@ -7,9 +7,9 @@ reflection; the others cast whole ones.
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.brdf import coat_albedo, make_brdf, widen_roughness
-from synpick_warp.kernels.render.lighting.materials import interpolate_surface, material_at, sample_base_color, wear_at
-from synpick_warp.kernels.render.lighting.paths.tracing import RandomizedScene
+from synpick_warp.kernels.render.lighting.brdf import coat_albedo, widen_roughness
+from synpick_warp.kernels.render.lighting.materials import brdf_of, interpolate_surface, material_at, sample_base_color, wear_at
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.surfaces import RandomizedSurfaces
 from synpick_warp.kernels.render.visibility.camera import hit_position
 from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Hit, ViewBodies, body_of
@@ -85,7 +85,7 @@ class PassingLight:
 
 
 @wp.func
-def passing_light(scene: RandomizedScene, shot: AnyShot, view: int, hit: Hit, ray: wp.vec3, width: float) -> PassingLight:
+def passing_light(scene: AnyScene, shot: AnyShot, view: int, hit: Hit, ray: wp.vec3, width: float) -> PassingLight:
     """Light that passes the first surface of a camera ray: what the coat lets in, tinted by the base colour; zero where it is opaque. It is
     bent once, by the thickness of the body, as in a pane. `width` is the pixel's footprint [m]."""
     result = PassingLight()
@@ -101,7 +101,7 @@ def passing_light(scene: RandomizedScene, shot: AnyShot, view: int, hit: Hit, ra
     wear = wear_at(scene.surfaces, surface, False)
     material = material_at(scene.surfaces, surface, wear)
     roughness = widen_roughness(material.roughness, surface.normal_spread)
-    brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
+    brdf = brdf_of(scene.surfaces, surface, material, roughness, outgoing, 0.0)
     # Dust covers; what is no metal does not rust.
     result.passing = material.transmission * (1.0 - wear.share[3]) * (1.0 - coat_albedo(brdf, brdf.albedo))
     result.weight = result.passing * sample_base_color(scene.surfaces, surface)

@@ -5,8 +5,9 @@ It is the denominator of the ratio estimator in `paths.coarse`.
 
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.brdf import Brdf, SplitRadiance, coat_albedo, specular_albedo
+from synpick_warp.kernels.render.lighting.brdf import MIN_COSINE, AnyBrdf, Brdf, SplitRadiance, coat_albedo, specular_albedo
 from synpick_warp.kernels.render.lighting.environment import SH_CONSTANT, Lights, prefiltered_radiance, rotate_z, sh_irradiance
+from synpick_warp.kernels.render.lighting.finish import FinishedBrdf
 
 wp.set_module_options({"enable_backward": False})
 
@@ -14,6 +15,8 @@ MIN_UNOCCLUDED = wp.constant(0.05)
 """Unoccluded light is at least this fraction of the map's mean, so that visibility ratios stay bounded."""
 MIN_EXPOSED = wp.constant(1.0e-3)
 """And, times the map's exposure, at least this, so that half precision holds it and its ratios where a map is black but for its lamps."""
+BRUSH_TAPS = wp.constant(8)
+"""Look-ups of the prefiltered map for an anisotropic lobe."""
 
 
 @wp.func
@@ -23,7 +26,7 @@ def max_channels(a: wp.vec3, b: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def unoccluded_light(lights: Lights, light: int, yaw: float, brdf: Brdf) -> SplitRadiance:
+def unoccluded_light(lights: Lights, light: int, yaw: float, brdf: AnyBrdf) -> SplitRadiance:
     """Radiance reflected from an unoccluded environment map without its lamps; nothing is indirect. Diffuse by spherical harmonics,
     specular by the split-sum approximation (Karis, 2013). `light` is the index of the map, rotated by `yaw` [rad] about +z."""
     radiance = SplitRadiance()
@@ -35,7 +38,40 @@ def unoccluded_light(lights: Lights, light: int, yaw: float, brdf: Brdf) -> Spli
     mirrored = 2.0 * wp.dot(brdf.normal, brdf.outgoing) * brdf.normal - brdf.outgoing
     prefiltered = max_channels(prefiltered_radiance(lights, light, rotate_z(mirrored, -yaw), brdf.roughness), floor / wp.PI)
     radiance.specular = wp.cw_mul(specular_albedo(brdf), prefiltered)
+    return finish_light(lights, light, yaw, brdf, radiance, floor / wp.PI)
+
+
+@wp.func
+def finish_light(lights: Lights, light: int, yaw: float, brdf: Brdf, radiance: SplitRadiance, least: wp.vec3) -> SplitRadiance:
+    """Unoccluded light of a surface, of which `radiance` is without coat and anisotropy; `least`: that of the map."""
     return radiance
+
+
+@wp.func
+def finish_light(  # noqa: F811
+    lights: Lights, light: int, yaw: float, brdf: FinishedBrdf, radiance: SplitRadiance, least: wp.vec3
+) -> SplitRadiance:
+    """Unoccluded light of a surface. Of an anisotropic lobe, facets along the tangent reflect it: quantiles of their slopes, weighted by
+    their visible area, with a lobe as wide as their distance."""
+    result = radiance
+    if brdf.widths[0] > brdf.widths[1]:
+        width = brdf.widths[0] / float(BRUSH_TAPS)
+        roughness = wp.sqrt(wp.sqrt(brdf.widths[1] * brdf.widths[1] + width * width))
+        total, weight = wp.vec3(0.0, 0.0, 0.0), float(0.0)
+        for tap in range(BRUSH_TAPS):
+            sine = float(2 * tap + 1) / float(BRUSH_TAPS) - 1.0
+            facet = wp.normalize(brdf.normal + brdf.widths[0] * sine / wp.sqrt(1.0 - sine * sine) * brdf.tangent)
+            cosine = wp.dot(facet, brdf.outgoing)
+            mirrored = 2.0 * cosine * facet - brdf.outgoing
+            if cosine > 0.0 and wp.dot(mirrored, brdf.normal) > 0.0:
+                weight += cosine
+                total += cosine * prefiltered_radiance(lights, light, rotate_z(mirrored, -yaw), roughness)
+        result.specular = wp.cw_mul(specular_albedo(brdf), max_channels(total / wp.max(weight, MIN_COSINE), least))
+    if brdf.clearcoat > 0.0:
+        coat = unoccluded_light(lights, light, yaw, brdf.coat)
+        result.diffuse = brdf.passing * radiance.diffuse
+        result.specular = brdf.passing * result.specular + brdf.clearcoat * coat.specular
+    return result
 
 
 @wp.func

@@ -8,9 +8,9 @@ from typing import Any
 
 import warp as wp
 
-VARIANTS: dict[str, tuple[Any, Any]] = {}
-"""Structs of parameters annotated `Any`, by name: the plain one and that of the variant. Modules that define structs add theirs."""
-_parameters: dict[wp.Kernel, dict[str, tuple[Any, Any]]] = {}
+VARIANTS: dict[str, tuple[Any, ...]] = {}
+"""Structs of parameters annotated `Any`, by name: the plain one and those of variants. Modules that define structs add theirs."""
+_parameters: dict[wp.Kernel, dict[str, tuple[Any, ...]]] = {}
 """Parameters of each generic kernel that are annotated `Any`, with their structs."""
 _templates: dict[wp.Kernel, wp.Kernel] = {}
 """Generic kernel of each plain kernel."""
@@ -24,14 +24,16 @@ def variant_of(struct: Any, name: str, **members: Any) -> Any:
     return wp.struct(type(name, (), body))
 
 
-def kernel_of_views(function: Callable[..., None] | None = None, *, name: str = "", **options: Any) -> Any:
-    """Decorate a kernel with parameters of `VARIANTS`, as `wp.kernel` does; the result is the plain kernel. `name`: of a closure."""
+def kernel_of_views(function: Callable[..., None] | None = None, *, name: str = "", drawn: bool = False, **options: Any) -> Any:
+    """Decorate a kernel with parameters of `VARIANTS`, as `wp.kernel` does; the result is the plain kernel. `name`: of a closure. `drawn`:
+    no scene is plain, and the first of the others counts as such."""
     if function is None:
-        return lambda decorated: kernel_of_views(decorated, name=name, **options)
+        return lambda decorated: kernel_of_views(decorated, name=name, drawn=drawn, **options)
     function.__qualname__ = name or function.__qualname__
     template: Any = wp.kernel(function, **options)
-    _parameters[template] = {name: VARIANTS[name] for name, given in template.func.__annotations__.items() if given is Any}
-    kernel = wp.overload(template, {name: plain for name, (plain, _) in _parameters[template].items()})
+    generic = [name for name, given in template.func.__annotations__.items() if given is Any]
+    _parameters[template] = {name: VARIANTS[name][drawn and name == "scene" :] for name in generic}
+    kernel = wp.overload(template, {name: plain for name, (plain, *_) in _parameters[template].items()})
     _templates[kernel] = template
     return kernel
 
@@ -40,7 +42,7 @@ def kernel_for(kernel: wp.Kernel, *arguments: Any) -> wp.Kernel:
     """Kernel to launch with these arguments: its variant for the structs among them that are not plain."""
     if kernel not in _templates:
         return kernel
-    structs = {special for _, special in _parameters[_templates[kernel]].values()}
+    structs = {special for _, *specials in _parameters[_templates[kernel]].values() for special in specials}
     given = frozenset(special for special in structs if any(isinstance(argument, special.cls) for argument in arguments))
     if not given:
         return kernel
@@ -48,7 +50,7 @@ def kernel_for(kernel: wp.Kernel, *arguments: Any) -> wp.Kernel:
         # All of the module at once: a further kernel compiles its module again.
         for plain, template in _templates.items():
             variable = _parameters[template]
-            if plain.module is kernel.module and given <= {special for _, special in variable.values()}:
-                types = {name: special if special in given else one for name, (one, special) in variable.items()}
+            if plain.module is kernel.module and given <= {special for _, *specials in variable.values() for special in specials}:
+                types = {name: next((each for each in specials if each in given), one) for name, (one, *specials) in variable.items()}
                 _kernels[plain, given] = wp.overload(template, types)
     return _kernels[kernel, given]

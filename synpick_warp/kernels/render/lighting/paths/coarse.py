@@ -35,7 +35,6 @@ from synpick_warp.kernels.render.lighting.paths.tracing import (
     AnyScene,
     PathContext,
     PathRules,
-    Vertex,
     extend_path,
     init_path,
     make_vertex,
@@ -80,7 +79,7 @@ def make_context(scene: AnyScene, coarse: CoarseGrid, rules: PathRules, shot: An
 
 @wp.func
 def average_paths(
-    scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, samples: int, first: Vertex, width: float, pixel: PathPixel
+    scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, samples: int, first: Any, width: float, pixel: PathPixel
 ) -> SplitRadiance:
     """Monte Carlo mean of the reflected light over `samples` paths of a coarse pixel, each limited by the firefly clamp (`clamp_path`). The
     paths start at the vertex `first`; `width` is their footprint there [m]."""
@@ -177,7 +176,7 @@ def finish_path(
 
 @wp.func
 def make_path_pixel(
-    scene: AnyScene, rules: PathRules, context: PathContext, vertex: Vertex, index: int, segment: int, known: int, number: int
+    scene: AnyScene, rules: PathRules, context: PathContext, vertex: Any, index: int, segment: int, known: int, number: int
 ) -> PathPixel:
     """Data with which the light of a coarse pixel's paths is combined: unoccluded light, diffuse colour, firefly limit, history length.
     `vertex`: the surface that the coarse pixel shows, with segmentation id `segment`. `index`: index of the coarse pixel in interleaved

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.brdf import Brdf, SplitRadiance, specular_albedo
+from synpick_warp.kernels.render.lighting.brdf import AnyBrdf, SplitRadiance, specular_albedo
 from synpick_warp.kernels.render.lighting.color import MAX_HALF, MIN_RADIANCE, luminance, pack_half3
 from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.kernels.render.visibility.records import write_record, write_uint64
@@ -57,7 +57,7 @@ def lamplit_radiance(lights: Lights, light: int) -> wp.vec3:
 
 
 @wp.func
-def limit_specular(brdf: Brdf, unoccluded: SplitRadiance, lamplit: wp.vec3, firefly_clamp: float) -> float:
+def limit_specular(brdf: AnyBrdf, unoccluded: SplitRadiance, lamplit: wp.vec3, firefly_clamp: float) -> float:
     """Firefly clamp of the specular light of a surface: limit of its largest channel. Parameters: see `clamp_path`."""
     return wp.max(firefly_clamp * unoccluded.specular + wp.cw_mul(specular_albedo(brdf), lamplit))
 

@@ -14,9 +14,10 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import Segment, Stream
-from synpick_warp.kernels.render.lighting.brdf import Brdf, BrdfValue, SplitRadiance, brdf_pdf, evaluate_brdf, make_brdf, sample_brdf
+from synpick_warp.kernels.render.lighting.brdf import Brdf, BrdfValue, SplitRadiance, brdf_pdf, evaluate_brdf, sample_brdf
 from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
-from synpick_warp.kernels.render.lighting.materials import interpolate_surface, make_table_surface, map_table, material_at, wear_at
+from synpick_warp.kernels.render.lighting.finish import FinishedBrdf
+from synpick_warp.kernels.render.lighting.materials import brdf_of, interpolate_surface, make_table_surface, map_table, material_at, wear_at
 from synpick_warp.kernels.render.lighting.sampling import (
     EnvironmentCdf,
     EnvironmentSample,
@@ -24,7 +25,7 @@ from synpick_warp.kernels.render.lighting.sampling import (
     sample_environment,
     scrambled_point,
 )
-from synpick_warp.kernels.render.lighting.surfaces import RandomizedSurfaces, Surfaces, add_emission
+from synpick_warp.kernels.render.lighting.surfaces import AnySurfaces, FinishedSurfaces, RandomizedSurfaces, Surfaces, add_emission
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
 from synpick_warp.kernels.render.visibility.camera import camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, AnyShot, Hit, Meshes, ShadedImage, Table, body_of
@@ -63,9 +64,11 @@ class PathScene:
 
 RandomizedScene = variant_of(PathScene, "RandomizedScene", surfaces=RandomizedSurfaces)
 """Scene with domain randomization: materials are sampled for each episode."""
+FinishedScene = variant_of(PathScene, "FinishedScene", surfaces=FinishedSurfaces)
+"""The same, with clear coats and anisotropy."""
 AnyScene = Any
-"""`PathScene`, or `RandomizedScene`: functions are compiled for each; see `variants`."""
-VARIANTS["scene"] = PathScene, RandomizedScene
+"""`PathScene`, `RandomizedScene` or `FinishedScene`: functions are compiled for each; see `variants`."""
+VARIANTS["scene"] = PathScene, RandomizedScene, FinishedScene
 
 
 @wp.struct
@@ -130,6 +133,22 @@ class Vertex:
     """As in `SurfaceMaterial`."""
 
 
+FinishedVertex = variant_of(Vertex, "FinishedVertex", brdf=FinishedBrdf)
+"""The same of `FinishedScene`; functions are compiled for each type of `vertex`."""
+
+
+@wp.func
+def new_vertex(surfaces: AnySurfaces) -> Vertex:
+    """Empty vertex of a scene."""
+    return Vertex()
+
+
+@wp.func
+def new_vertex(surfaces: FinishedSurfaces) -> FinishedVertex:  # noqa: F811
+    """Empty vertex of a scene."""
+    return FinishedVertex()
+
+
 @wp.struct
 class Path:
     """State of a path between two bounces: radiance so far, throughput, and the last hit."""
@@ -159,7 +178,7 @@ def make_vertex(
     width: float,
     min_roughness: float,
     is_mean: bool,
-) -> Vertex:
+):
     """Build the path vertex at a hit. `outgoing`: direction back along the ray. `width`: footprint across the ray [m]. `is_mean`: use the
     surface's mean wear instead of its noise pattern, which costs more than tracing the ray; set after the first bounce."""
     bodies = shot.bodies
@@ -172,13 +191,13 @@ def make_vertex(
         # Exactly on the table: far away, float32 rounding moves a hit off its plane by more than RAY_OFFSET.
         at = wp.vec3(position[0], position[1], scene.table.height)
         surface = map_table(scene.surfaces, surface, at, outgoing, width)
-    vertex = Vertex()
+    vertex = new_vertex(scene.surfaces)
     vertex.origin = at + RAY_OFFSET * surface.face_normal
     vertex.face_normal = surface.face_normal
     material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface, is_mean))
     vertex.emission = material.emission
     roughness = wp.max(material.roughness, min_roughness)
-    vertex.brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
+    vertex.brdf = brdf_of(scene.surfaces, surface, material, roughness, outgoing, min_roughness)
     return vertex
 
 
@@ -226,7 +245,7 @@ def meet_emission(surfaces: Surfaces, path: Path, emission: wp.vec3, exposure: f
 
 
 @wp.func
-def meet_emission(surfaces: RandomizedSurfaces, path: Path, emission: wp.vec3, exposure: float) -> SplitRadiance:  # noqa: F811
+def meet_emission(surfaces: AnySurfaces, path: Path, emission: wp.vec3, exposure: float) -> SplitRadiance:  # noqa: F811
     """Radiance of a path with what the last surface emits, as light from other surfaces. What the camera sees is added apart."""
     if path.bounce == 0 or wp.max(emission) == 0.0:
         return path.radiance
@@ -244,7 +263,7 @@ def sample_point(context: PathContext, index: int, dimension: int) -> wp.vec2:
 
 @wp.func
 def sample_direct_light(
-    scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, light: int, vertex: Vertex, u: wp.vec2
+    scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, light: int, vertex: Any, u: wp.vec2
 ) -> EnvironmentSample:
     """Next-event estimation: sample a direction of the map and test it by a shadow ray.
 
@@ -297,14 +316,14 @@ def init_path(width: float) -> Path:
 
 
 @wp.func
-def next_vertex(scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, path: Path) -> Vertex:
+def next_vertex(scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, path: Path):
     """Build the vertex at the last hit of a path that goes on."""
     return make_vertex(scene, shot, context.view, path.hit, path.position, -path.direction, path.width, rules.min_roughness, True)
 
 
 @wp.func
 def extend_path(
-    scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, index: int, first_diffuse: wp.vec3, path: Path, vertex: Vertex
+    scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, index: int, first_diffuse: wp.vec3, path: Path, vertex: Any
 ) -> Path:
     """Scatter path `index` once at its last `vertex`: add the direct light there, then move the path to the next hit or terminate it.
     `first_diffuse` is the diffuse colour of the path's first surface, which multiplies all its diffuse light in the end."""
