@@ -29,7 +29,7 @@ from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.files import PARTIAL, checksum, list_files, parse_checksums, write_manifest_entry
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.embedded.skies import skies
-from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Material, Sun, TriangleMesh
+from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Finish, Material, Sun, TriangleMesh
 from synpick_warp.system.processes import pool
 from synpick_warp.system.processes.pool import ProcessError
 from synpick_warp.views.frames import EpisodeEnd
@@ -115,9 +115,11 @@ def test_inputs_are_known_by_their_content():
     changes = [(digests["objects"] != known["objects"], digests["lights"] != known["lights"]) for digests in (heavier, brighter)]
     assert changes == [(True, False), (False, True)]
     materials = [dataclasses.replace(entry.material, emission=(1.0, 0.5, 0.0), glow=glow) for glow in (None, np.zeros((2, 2, 3), np.uint8))]
+    materials.append(dataclasses.replace(entry.material, finish=Finish(clearcoat=0.5)))
     lit = [dataclasses.replace(catalog(), entries=(first, dataclasses.replace(entry, material=each), *others)) for each in materials]
-    shining, textured = (digest_inputs(each, skies()) for each in lit)
+    shining, textured, coated = (digest_inputs(each, skies()) for each in lit)
     assert [manifest.describe_inputs(known, shining), manifest.describe_inputs(shining, textured)] == ["emission (2: boxes_2)"] * 2
+    assert manifest.describe_inputs(known, coated) == "finish (2: boxes_2)"
 
 
 def test_inputs_that_differ_are_named_with_their_objects():

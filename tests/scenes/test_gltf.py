@@ -331,9 +331,9 @@ def test_required_extensions_that_are_not_implemented_are_named(tmp_path, extens
 
 
 def test_what_is_ignored_is_one_line(tmp_path):
-    builder = Builder(occlusionTexture={"index": 0}, alphaMode="BLEND").require("KHR_materials_clearcoat")
+    builder = Builder(occlusionTexture={"index": 0}, alphaMode="BLEND").require("KHR_materials_sheen")
     _, finish, said = builder.with_(animations=[{}]).read(tmp_path)
-    assert said == ["ignored: KHR_materials_clearcoat, animations, transparency"]
+    assert said == ["ignored: KHR_materials_sheen, animations, transparency"]
     assert (finish.metallic, finish.roughness) == (1.0, 1.0)
 
 

@@ -16,7 +16,7 @@ from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
-from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
+from synpick_warp.scenes.types import Catalog, EnvironmentMap, Finish, Material
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 FRAMES = 70
@@ -44,7 +44,9 @@ def textured(catalog: Catalog) -> Catalog:
     material = Material((0.9, 0.8, 0.7), numbers.integers(0, 256, (24, 32, 3), dtype=np.uint8), 0.3, 0.6)
     maps = numbers.integers(64, 192, (24, 32, 4), dtype=np.uint8)
     material = dataclasses.replace(material, maps=maps, emission=(0.0, 3.0, 1.0), glow=maps[..., :3])
-    first = dataclasses.replace(first, material=dataclasses.replace(first.material, emission=(0.5, 0.25, 0.0)))
+    first = dataclasses.replace(
+        first, material=dataclasses.replace(first.material, emission=(0.5, 0.25, 0.0), finish=Finish(0.5, 0.25, 0.75))
+    )
     return Catalog((first, dataclasses.replace(second, mesh=mesh, material=material), *others))
 
 

@@ -47,7 +47,7 @@ from synpick_warp.exporters.writing.files import (
 )
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.looks import Looks
-from synpick_warp.scenes.types import BLACK, OPAQUE, Catalog, EnvironmentMap, Material
+from synpick_warp.scenes.types import BLACK, OPAQUE, PLAIN, Catalog, EnvironmentMap, Material
 from synpick_warp.system import clock
 from synpick_warp.system.inputs.files import MAX_TOML, check_regular_file, make_folder
 from synpick_warp.views.frames import EpisodeEnd
@@ -360,29 +360,33 @@ def remove_path(path: Path) -> None:
 def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
     """Content digests of a bake's inputs, by which a resumed bake recognizes other objects or lights: the manifest's INPUTS.
 
-    SHA-256 over objects, lights, distractors, props, textures, maps, glass and emission, without file names, and over each object: mesh,
-    material, collision shape, mass properties and symmetries. Names and order of the dataclasses' fields are hashed, too: renaming a field
-    of `Catalog` or `EnvironmentMap` changes every manifest.
+    SHA-256 over objects, lights, distractors, props, textures, maps, glass, emission and finish, without file names, and over each object:
+    mesh, material, collision shape, mass properties and symmetries. Names and order of the dataclasses' fields are hashed, too: renaming a
+    field of `Catalog` or `EnvironmentMap` changes every manifest.
     """
     textures = {"textures": _digest_data(tuple(looks.textures.values()))} if looks and looks.all_textures else {}
     distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
-    props = tuple((prop, prop.fixture.material.maps, *_emission(prop.fixture.material)) for prop in catalog.props)
+    props = tuple(
+        (prop, (look := prop.fixture.material).maps, *_added(look)["emission"], *_added(look)["finish"]) for prop in catalog.props
+    )
     distractors |= {"props": _digest_data(props)} if props else {}
-    maps = {body.obj_id: (body.material.maps,) for body in catalog.bodies if body.material.maps is not None}
-    textures |= {"maps": _digest_data(tuple(maps.values()))} if maps else {}
-    glass = {body.obj_id: (body.material.glass, body.material.opacity) for body in catalog.bodies if body.material.glass != OPAQUE}
-    textures |= {"glass": _digest_data(tuple(glass.values()))} if glass else {}
-    lit = {body.obj_id: light for body in catalog.bodies if (light := _emission(body.material))}
-    textures |= {"emission": _digest_data(tuple(lit.values()))} if lit else {}
-    added = {body.obj_id: sum((each.get(body.obj_id, ()) for each in (maps, glass, lit)), ()) for body in catalog.bodies}
-    given = [(body, *more) if (more := added[body.obj_id]) else body for body in catalog.bodies]
+    added = [_added(body.material) for body in catalog.bodies]
+    for name in ("maps", "glass", "emission", "finish"):
+        values = tuple(more[name] for more in added if more[name])
+        textures |= {name: _digest_data(values)} if values else {}
+    given = [(body, *sum(more.values(), ())) if any(more.values()) else body for body, more in zip(catalog.bodies, added, strict=True)]
     each = {f"{manifest.OBJECT}{body.obj_id}: {body.name}": _digest_data(data) for body, data in zip(catalog.bodies, given, strict=True)}
     return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures | each
 
 
-def _emission(material: Material) -> tuple[Any, ...]:
-    """Emission factor and texture of a material, for its digest; empty if it emits nothing."""
-    return () if material.emission == BLACK else (material.emission, material.glow)
+def _added(material: Material) -> dict[str, tuple[Any, ...]]:
+    """Values of a material that are not hashed with it, by the name of their digest; empty where it has none."""
+    return {
+        "maps": () if material.maps is None else (material.maps,),
+        "glass": () if material.glass == OPAQUE else (material.glass, material.opacity),
+        "emission": () if material.emission == BLACK else (material.emission, material.glow),
+        "finish": () if material.finish == PLAIN else (material.finish,),
+    }
 
 
 def _digest_data(value: object) -> str:

@@ -118,6 +118,9 @@ def add_surface(
     if material.transmission > 0.0:
         shader.CreateInput("opacity", Sdf.ValueTypeNames.Float).Set(1.0 - material.transmission)
         shader.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(material.glass.ior)
+    if material.finish.clearcoat > 0.0:
+        shader.CreateInput("clearcoat", Sdf.ValueTypeNames.Float).Set(material.finish.clearcoat)
+        shader.CreateInput("clearcoatRoughness", Sdf.ValueTypeNames.Float).Set(material.finish.clearcoat_roughness)
     if any(material.emission):
         shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*material.emission))
     color: UsdShade.Input = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)

@@ -275,7 +275,7 @@ def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, An
     glass = replace(given.glass, transmission=look.get("transmission", given.glass.transmission))
     emission = BLACK if "texture" in look else given.emission
     drawn = {"metallic": look.get("metallic", given.metallic), "roughness": look.get("roughness", given.roughness)}
-    material = Material(color, None, **drawn, glass=glass, emission=emission)
+    material = Material(color, None, **drawn, glass=glass, emission=emission, finish=given.finish)
     maps = surface.maps - look.keys() if "texture" not in look else ()
     add_surface(stage, f"{path}/Materials/Surface", material, texture and f"assets/{texture}", gain, repeats, maps)
 

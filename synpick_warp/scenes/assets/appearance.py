@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
-from synpick_warp.scenes.types import BLACK, MAP_CENTER, OPAQUE, Glass, Material
+from synpick_warp.scenes.types import BLACK, MAP_CENTER, OPAQUE, PLAIN, Finish, Glass, Material
 from synpick_warp.system.linear_algebra import DECIMALS
 
 MAX_TEXTURE_FILE = 2**27
@@ -50,6 +50,7 @@ class FileMaterial:
     emission: tuple[float, float, float] = BLACK
     has_glow: bool = False
     """Whether the file has an emission texture, which `texture` has, too, unless its maps were dropped."""
+    finish: Finish = PLAIN
 
     @property
     def glow(self) -> np.ndarray | None:
@@ -75,11 +76,11 @@ class FileMaterial:
         """Material with these values where the file states none."""
         given = (metallic if self.metallic is None else self.metallic, roughness if self.roughness is None else self.roughness)
         if self.texture is None or self.texture.shape[2] == 3:
-            return Material(self.color, self.texture, *given, glass=self.glass, emission=self.light)
+            return Material(self.color, self.texture, *given, glass=self.glass, emission=self.light, finish=self.finish)
         maps = self.texture[..., 3:7].copy() if self.has_maps else None
         opacity = self.texture[..., -1].copy() if self.texture.shape[2] in (4, 8, 11) else None
         glow = None if self.glow is None else self.glow.copy()
-        return Material(self.color, self.texture[..., :3].copy(), *given, maps, self.glass, opacity, self.light, glow)
+        return Material(self.color, self.texture[..., :3].copy(), *given, maps, self.glass, opacity, self.light, glow, self.finish)
 
     def add_glow(self, most: float) -> "FileMaterial":
         """Same emission as `most` (a factor that several parts share) times an emission texture; metallic and roughness must be stated."""

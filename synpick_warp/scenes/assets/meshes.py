@@ -322,15 +322,17 @@ def _bake_colors(part: MeshPart, notes: Notes) -> MeshPart:
         color = appearance.as_color(appearance.linear_to_srgb(factor * appearance.srgb_to_linear(part.colors[0])))
         return replace(part, colors=None, material=replace(part.material, color=color))
     notes.ignored += ["maps beneath vertex colours"] if part.material.has_maps else []
+    notes.ignored += ["anisotropy beneath vertex colours"] if part.material.finish.anisotropy else []
     skin = None if part.material.texture is None or part.uv is None else (part.uv, part.material.texture[..., :3])
     uv, texture = appearance.bake_vertex_colors(part.faces, part.colors, factor, skin)
-    material = replace(part.material, color=appearance.WHITE, texture=texture)
+    finish = replace(part.material.finish, anisotropy=0.0, rotation=0.0)
+    material = replace(part.material, color=appearance.WHITE, texture=texture, finish=finish)
     return part.take(part.faces.reshape(-1), np.arange(part.faces.size).reshape(-1, 3), uv=uv, colors=None, material=material)
 
 
 def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes) -> MeshPart:
     """Merge all parts into one, with one material: a texture with maps where metallic or roughness differ, or a part has maps. Where not
-    all parts state both, they are averaged by area."""
+    all parts state both, they are averaged by area. Clearcoat and anisotropy are those of the largest part."""
     if len(parts) == 1:
         return parts[0]
     parts = _share_opacity(_share_maps(_share_emission(parts, notes), notes))
@@ -345,6 +347,9 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
         known = [(value, _area(part)) for part in parts if (value := getattr(part.material, name)) is not None]
         total = sum(area for _, area in known)
         mean[name] = sum(value * area for value, area in known) / total if total > 0.0 else None
+    finish = max(parts, key=_area).material.finish
+    if any(part.material.finish != finish for part in parts):
+        notes.ignored.append("clearcoat and anisotropy but for those of the largest part")
     if any(part.normals is not None for part in parts):
         parts = [complete_normals(part, options.crease_angle) for part in parts]
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -355,7 +360,7 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
         np.concatenate(normals) if normals else None,
         np.concatenate([np.zeros((len(part.vertices), 2)) if part.uv is None else part.uv for part in parts]),
         None,
-        replace(first, **mean),
+        replace(first, **mean, finish=finish),
     )
 
 

@@ -184,6 +184,11 @@ def test_objects_have_their_meshes_and_materials(folder, entry):
         np.testing.assert_allclose(color.Get(), linear, rtol=1e-6)
         emission = shader.GetInput("emissiveColor")
         assert tuple(emission.Get() if emission else (0.0, 0.0, 0.0)) == entry.material.emission
+        coat = [shader.GetInput(name) for name in ("clearcoat", "clearcoatRoughness")]
+        assert [each.Get() if each else 0.0 for each in coat] == [
+            entry.material.finish.clearcoat,
+            entry.material.finish.clearcoat_roughness,
+        ]
         return
     image = UsdShade.Shader(color.GetConnectedSources()[0][0].source.GetPrim())
     np.testing.assert_allclose(image.GetInput("scale").Get(), [*linear, 1.0], rtol=1e-6)

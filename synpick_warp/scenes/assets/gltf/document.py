@@ -29,7 +29,8 @@ QUANTIZATION, TRANSFORM, WEBP = "KHR_mesh_quantization", "KHR_texture_transform"
 GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 TRANSMISSION, IOR, VOLUME = "KHR_materials_transmission", "KHR_materials_ior", "KHR_materials_volume"
 EMISSION = "KHR_materials_emissive_strength"
-_IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS, TRANSMISSION, IOR, VOLUME, EMISSION}
+CLEARCOAT, ANISOTROPY = "KHR_materials_clearcoat", "KHR_materials_anisotropy"
+_IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS, TRANSMISSION, IOR, VOLUME, EMISSION, CLEARCOAT, ANISOTROPY}
 # Required extensions that change how a surface looks, or what is beside it, but neither its shape nor its base colour: they are ignored.
 _DISPENSABLE = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_", "KHR_xmp", "KHR_node_visibility")
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -221,6 +222,24 @@ class EmissiveStrength(msgspec.Struct):
     emissiveStrength: float = 1.0  # noqa: N815
 
 
+class Clearcoat(msgspec.Struct):
+    """Factor and roughness of a clear coat, and their textures (KHR_materials_clearcoat)."""
+
+    clearcoatFactor: float = 0.0  # noqa: N815
+    clearcoatTexture: TextureInfo | None = None  # noqa: N815
+    clearcoatRoughnessFactor: float = 0.0  # noqa: N815
+    clearcoatRoughnessTexture: TextureInfo | None = None  # noqa: N815
+    clearcoatNormalTexture: Any = None  # noqa: N815
+
+
+class Anisotropy(msgspec.Struct):
+    """Strength and direction of anisotropy, and their texture (KHR_materials_anisotropy)."""
+
+    anisotropyStrength: float = 0.0  # noqa: N815
+    anisotropyRotation: float = 0.0  # noqa: N815
+    anisotropyTexture: TextureInfo | None = None  # noqa: N815
+
+
 class MaterialExtensions(msgspec.Struct):
     """Extensions of a material that are read."""
 
@@ -229,6 +248,8 @@ class MaterialExtensions(msgspec.Struct):
     ior: Ior | None = msgspec.field(name=IOR, default=None)
     volume: Volume | None = msgspec.field(name=VOLUME, default=None)
     strength: EmissiveStrength = msgspec.field(name=EMISSION, default_factory=EmissiveStrength)
+    clearcoat: Clearcoat = msgspec.field(name=CLEARCOAT, default_factory=Clearcoat)
+    anisotropy: Anisotropy = msgspec.field(name=ANISOTROPY, default_factory=Anisotropy)
 
 
 class GltfMaterial(msgspec.Struct):

@@ -13,6 +13,7 @@ from synpick_warp.scenes.assets import appearance
 from synpick_warp.scenes.assets.alpha_masks import CLAMP, MAX_TRIANGLES, MIRROR, mask_part
 from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, Notes, reading_as
 from synpick_warp.scenes.assets.gltf import document as schema
+from synpick_warp.scenes.assets.gltf.finish import brush_coordinates, read_finish
 from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices
 from synpick_warp.scenes.types import BLACK, OPAQUE, Glass
 from synpick_warp.system.linear_algebra import DECIMALS, cofactors, det, dot, matmul
@@ -157,6 +158,8 @@ class _Reader:
                 raise CatalogError(f"{self.path}: has a texture, but vertices without texture coordinates; unwrap it or remove the texture")
             else:
                 uv = _transform_uv(uv, info)
+        if uv is None and material.finish.anisotropy > 0.0:
+            uv = brush_coordinates(vertices, self.attribute(attributes.get("TEXCOORD_0"), "TEXCOORD_0", (2,), count))
         if primitive.targets:
             self.notes.ignored.append("morph targets")
         if colors is not None:
@@ -245,7 +248,8 @@ class _Reader:
             gloss = material.extensions.glossiness if material.extensions else None
             pbr = material.pbrMetallicRoughness or schema.Pbr()
             found, info = self.gloss(gloss) if gloss else self.pbr(pbr)
-            found = replace(found, glass=self.glass(material), emission=self.emission(material))
+            finish = read_finish(material.extensions or schema.MaterialExtensions(), self.texture, self.notes, self.path)
+            found = replace(found, glass=self.glass(material), emission=self.emission(material), finish=finish)
             self.materials[index] = self.mapped(found, info, material, schema.Pbr() if gloss else pbr)
         return self.materials[index]
 
