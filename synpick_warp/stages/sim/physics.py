@@ -226,7 +226,7 @@ class Physics:
     def _set_gaps(self, state: newton.State) -> None:
         """Set the contact margins of all shapes by the speeds of their bodies."""
         physics, model = self.settings, self.model
-        margins = [min(REST_GAP, physics.gap), physics.gap, physics.step / physics.substeps]
+        margins = [min(REST_GAP, physics.gap), 2.0 * physics.gap, physics.step / physics.substeps]
         inputs = [*margins, model.shape_body, model.shape_transform, model.shape_collision_radius, model.body_com, state.body_qd]
         wp.launch(rest.set_gaps_kernel, dim=model.shape_count, inputs=inputs, outputs=[model.shape_gap], device=self.device)
 
