@@ -42,10 +42,18 @@ class Module(NamedTuple):
     """First line, name and number of lines."""
 
 
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements within, and the clauses that hold some; no expressions, which are most of a tree."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.stmt | ast.excepthandler | ast.match_case):
+            yield child
+            yield from statements(child)
+
+
 @functools.cache
 def parsed(path: Path) -> Module:
     tree = ast.parse(path.read_text())
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    functions = [node for node in statements(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     sizes = tuple((node.lineno, node.name, (node.end_lineno or node.lineno) - node.lineno + 1) for node in functions)
     return Module(ast.get_docstring(tree) is not None, sizes)
 

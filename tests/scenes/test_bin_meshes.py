@@ -74,15 +74,14 @@ def test_a_sloped_floor_and_a_divider_are_measured_and_have_shapes(tmp_path):
 @pytest.mark.parametrize(
     "mesh",
     [
-        sloped_bin(),
         sloped_bin().apply_transform(TURN(0.5, AROUND_Z)),
         meshes.round_bin(),
-        meshes.round_bin(sections=200),
+        meshes.round_bin(sections=100),
         meshes.low_front(),
         stepped_bin(),
         meshes.tote(),
     ],
-    ids=["sloped", "turned", "round", "fine", "front", "step", "tote"],
+    ids=["turned", "round", "fine", "front", "step", "tote"],
 )
 def test_shapes_fill_the_solid_behind_the_inside_and_nothing_of_it(tmp_path, mesh):
     """Along vertical rays from above, against the heights of the mesh by all of its triangles."""
@@ -116,13 +115,9 @@ def test_shapes_fill_the_solid_behind_the_inside_and_nothing_of_it(tmp_path, mes
     ],
 )
 def test_any_format_unit_and_axis_gives_the_same_bin(tmp_path, name, unit, scale, up, axis, angle):
-    def placed(mesh):
-        return mesh.apply_scale(scale).apply_transform(TURN(angle, axis))
-
-    found = model(tmp_path, placed(sloped_bin()), name, unit=unit, up=up).measured
-    assert sorted(found.opening) == pytest.approx([0.3, 0.4], abs=3e-3)
-    assert (found.height, len(found.compartments)) == (pytest.approx(0.2, abs=1e-4), 2)
-    _, sizes = read_sizes(tmp_path, placed(frustum()), name, unit=unit, up=up)
+    mesh = DIVIDED.copy().apply_scale(scale).apply_transform(TURN(angle, axis))
+    found, sizes = read_sizes(tmp_path, mesh, name, unit=unit, up=up)
+    assert (found.measured.height, len(found.measured.compartments)) == (pytest.approx(HEIGHT, abs=1e-4), 2)
     np.testing.assert_allclose(np.sort([sizes.floor, sizes.opening]), np.sort([FLOOR, opening_of(SLOPED)]), atol=5e-4)
 
 
@@ -179,9 +174,10 @@ ROWS = 'preset = "smoke"\n[bins]\nkind = "own"\n[[bin]]\nname = "kanban"\nfile =
 
 
 def read(tmp_path, text=ROWS, mesh=None):
-    """Settings with a mesh in a folder beside them."""
+    """Settings with a mesh in a folder beside them, of the first call for all."""
     (tmp_path / "bins").mkdir(exist_ok=True)
-    (mesh or sloped_bin()).export(tmp_path / "bins" / "kanban.stl")
+    if not (tmp_path / "bins" / "kanban.stl").exists():
+        (mesh or sloped_bin()).export(tmp_path / "bins" / "kanban.stl")
     (tmp_path / "own.toml").write_text(text)
     return load_config(str(tmp_path / "own.toml"))
 
@@ -228,18 +224,15 @@ def test_a_wrong_row_is_refused(tmp_path, text, message):
 CLOSE = "place = 'file'\n[pick]\nfloor = -0.6\n[cameras]\npositions = [[0, 0, -0.55]]\nups = [[0, 1, 0]]"
 
 
-@pytest.mark.parametrize(
-    ("lines", "message"),
-    [
+def test_rules_of_other_settings_hold_for_what_is_measured(tmp_path):
+    for lines, message in (
         ("[pick]\nlift_height = 0.19", r"pick.lift_height is 0.19 .*; allowed: at least the inner height of the bin, 0.2"),
         ("place = 'file'", r"pick.floor is -0.1 .*; allowed: at most the floor of the bin, -0.5: what is below it is removed"),
         (CLOSE, r"cameras.positions .* z > -0.5,"),
-    ],
-)
-def test_rules_of_other_settings_hold_for_what_is_measured(tmp_path, lines, message):
-    config = read(tmp_path, ROWS + lines, sloped_bin().apply_translation((0.0, 0.0, -0.5)))
-    with pytest.raises(ConfigError, match=message):
-        measured(config)
+    ):
+        config = read(tmp_path, ROWS + lines, sloped_bin().apply_translation((0.0, 0.0, -0.5)))
+        with pytest.raises(ConfigError, match=message):
+            measured(config)
 
 
 def test_a_tool_that_does_not_come_down_between_leaning_walls_is_refused(tmp_path):
@@ -258,7 +251,7 @@ def test_a_tool_that_does_not_come_down_between_leaning_walls_is_refused(tmp_pat
 @pytest.mark.parametrize(
     ("drafts", "more"),
     [
-        *((drafts, {}) for drafts in ((1,) * 4, UNEQUAL, (15, 15, 0, 0), (30,) * 4, (45,) * 4)),
+        *((drafts, {}) for drafts in ((1,) * 4, UNEQUAL, (15, 15, 0, 0))),
         *((UNEQUAL, more) for more in ({"radius": 0.03}, {"wall": 0.0}, {"wall": 0.03})),
         ((45,) * 4, {"wall": 0.03}),
     ],
@@ -286,7 +279,7 @@ def test_upright_walls_need_no_other_keys(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("angle", "yaw", "flip"), [(3, 3, False), (30, 30, True), (60, 60, False), (90, None, False), (100, -80, True), (200, 20, False)]
+    ("angle", "yaw", "flip"), [(3, 3, False), (30, 30, True), (90, None, False), (100, -80, True)]
 )
 def test_a_turned_bin_has_its_own_sides(tmp_path, angle, yaw, flip):
     """Its frame lies along them; in the world it is where the mesh is."""
@@ -303,13 +296,8 @@ def test_a_turned_bin_has_its_own_sides(tmp_path, angle, yaw, flip):
     assert np.ptp(sizes.corners, axis=0)[2] == pytest.approx(0.18)
 
 
-HOLES = {0.005: None, 0.01: None, 0.03: 30, 0.1: 100, 0.2: 200}
-"""Sides of holes [m], and what is said of each [mm]."""
-
-
 @pytest.mark.parametrize(
-    ("wall", "hole", "said"),
-    [*((0.004, *row) for row in HOLES.items()), *((wall, hole, HOLES[hole]) for wall in (0.0, 0.03) for hole in (0.01, 0.03))],
+    ("wall", "hole", "said"), [(0.004, 0.01, None), (0.004, 0.2, 200), (0.0, 0.01, None), (0.0, 0.03, 30), (0.03, 0.03, 30)]
 )
 def test_a_hole_is_named_and_the_floor_stays_where_it_is(tmp_path, hole, wall, said):
     found, sizes = read_sizes(tmp_path, frustum(hole=hole, wall=wall))
@@ -336,17 +324,15 @@ COMPARTMENTS = [(-0.093, 0, 0.226, 0.262), (0.143, 0, 0.126, 0.262)]
 @pytest.mark.parametrize(
     ("mesh", "rooms"),
     [
-        (frustum(), 1),
         (frustum(radius=0.05, drafts=(40,) * 4), 1),
         (frustum(floor=(0.1, 0.1), radius=0.05, drafts=(40,) * 4), 1),
         (frustum().apply_transform(TURN(0.5, AROUND_Z)), 1),
-        (stepped_bin(), 1),
         (JOIN([stepped_bin(), block((-0.2, -0.15, -0.002), (-0.1, 0.15, 0.06))]), 1),
         (meshes.low_front(), 1),
         (meshes.tote(), 1),
         (DIVIDED, 2),
     ],
-    ids=["frustum", "rounded", "funnel", "turned", "step", "steps", "drains", "tote", "divider"],
+    ids=["rounded", "funnel", "turned", "steps", "drains", "tote", "divider"],
 )
 def test_waypoints_and_objects_keep_to_the_floor(tmp_path, mesh, rooms):
     """Waypoints are as high above the mesh as is set; laid out objects touch it, and nothing of them is below."""
@@ -378,7 +364,7 @@ def test_what_is_longer_than_the_floor_lies_between_the_walls(tmp_path):
 
 @pytest.mark.parametrize(("draft", "angle"), [(0, 0), (30, 25)])
 def test_a_basket_collides_as_a_closed_box_on_request(tmp_path, draft, angle):
-    mesh = meshes.basket(draft, sections=6).apply_transform(TURN(np.radians(angle), AROUND_Z))
+    mesh = meshes.basket(draft, sections=4).apply_transform(TURN(np.radians(angle), AROUND_Z))
     found, sizes = read_sizes(tmp_path, mesh, collision="box")
     assert found.notes[1] == "bin own: it collides as a closed box; nothing falls through its holes"
     rise = np.tan(np.radians(draft)) * 0.15
@@ -388,7 +374,7 @@ def test_a_basket_collides_as_a_closed_box_on_request(tmp_path, draft, angle):
     assert len(found.mesh.faces) > 1000
     if draft == 0:
         with pytest.raises(ConfigError, match=r'or set collision = "box", which closes its holes'):
-            read_sizes(tmp_path, meshes.basket(gap=0.06, sections=6))
+            read_sizes(tmp_path, meshes.basket(gap=0.06, sections=4))
 
 
 @pytest.mark.parametrize("mesh", [frustum(drafts=UNEQUAL), DIVIDED], ids=["unequal", "divider"])

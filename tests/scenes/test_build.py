@@ -301,7 +301,7 @@ def sizes_of_boxes(budget: float) -> st.SearchStrategy[float]:
     return st.one_of(near, cubes, st.floats(1e-9, 4 * budget))
 
 
-@hypothesis_settings(max_examples=fuzz_examples(100), deadline=None)
+@hypothesis_settings(max_examples=fuzz_examples(40), deadline=None)
 @given(
     data=st.data(),
     budget=st.sampled_from((1e-3, 3e-3, 7e-3, 1e-4)),

@@ -25,11 +25,11 @@ STEP = SPEED * TOP / FOCAL
 SAMPLES = 32
 
 
-def scene(mode: str = UNOCCLUDED, worlds: int = 1, view=VIEW, samples: int = SAMPLES, **settings) -> ToyScene:
+def scene(mode: str = UNOCCLUDED, worlds: int = 1, view=VIEW, sub_frames: int = SAMPLES, **settings) -> ToyScene:
     """A white sheet, whose right edge is in the middle of the image, over a black one."""
     entries = [entry(sheet(3.0, 2.0), surface()), entry(sheet(9.0, 9.0), surface((0.0, 0.0, 0.0)))]
     placed = [(0, (-1.5, 0.0, 0.0, *UPRIGHT)), (1, (0.0, 0.0, -0.001, *UPRIGHT))]
-    config = with_render(mode, shutter_samples=samples, **settings)
+    config = with_render(mode, shutter_samples=sub_frames, **settings)
     return ToyScene(entries, [placed] * worlds, (view,), config=config)
 
 
@@ -115,11 +115,12 @@ def test_pictures_of_moving_cameras_are_blurred_whole(device, view):
     np.testing.assert_allclose(none[:, :, : WIDTH - 4], sharp[:, :, : WIDTH - 4], atol=1e-3)
 
 
-@pytest.mark.parametrize("mode", [FAST, UNOCCLUDED, REFERENCE])
-@pytest.mark.parametrize("kind", ["plain", "bent", "glass"])
+@pytest.mark.parametrize(
+    ("mode", "kind"), [(FAST, "plain"), (FAST, "glass"), (UNOCCLUDED, "bent"), (REFERENCE, "plain"), (REFERENCE, "glass")]
+)
 def test_views_in_which_nothing_moves_have_the_bytes_of_an_instant(device, mode, kind):
     """Others of the batch do not change them, and the truth stays."""
-    toy = scene(mode, 3, BENT if kind == "bent" else VIEW, 2, history=8)
+    toy = scene(mode, 3, BENT if kind == "bent" else VIEW, 2, history=8, samples=4)
     if kind == "glass":
         pane = replace(surface(roughness=0.1), glass=Glass(0.8, 1.5, 0.0))
         toy = replace(toy, entries=[entry(sheet(3.0, 2.0), pane), *toy.entries[1:]])

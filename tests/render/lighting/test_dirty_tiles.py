@@ -19,7 +19,7 @@ from tests.render.lighting.test_shadows import LAMPS
 from tests.worlds.shapes import UPRIGHT, ball, box, camera, entry, sheet
 from tests.worlds.toy_scene import ToyScene, build_scene, snapshot, with_render
 
-FRAMES = 24
+FRAMES = 16
 CAMERAS = (camera(90, 61, 200.0, (0.0, 0.0, 1.2)), camera(90, 61, 240.0, (0.05, 0.0, 1.5)))
 ENTRIES = [entry(sheet(0.5, 0.4)), entry(box(0.04, 0.04, 0.06)), entry(ball(0.03, 3)), entry(box(0.08, 0.01, 0.03))]
 ROOM = 6
