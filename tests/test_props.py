@@ -100,9 +100,9 @@ ROWS = (
 def bake(out: Path, slab: str, worlds: int) -> None:
     given = {"render.reuse": worlds == 1} | {
         "bake.formats": ["bop", "usd"],
-        "bake.episodes": 3,
+        "bake.episodes": 2,
         "bake.worlds": worlds,
-        "cameras.resolution": [96, 54],
+        "cameras.resolution": [48, 27],
     }
     config = settings(**{**PICKING, **given, "bins.kind": "none", "bins.area": [0.2, 0.2], "render.layers": ["classes"]})
     config = replace(config, prop=tuple(replace(row, mesh=row.mesh or slab) for row in ROWS))
@@ -134,9 +134,9 @@ def test_objects_lie_on_a_prop_that_collides(baked):
 
 
 def test_episodes_are_the_same_in_any_number_of_worlds(baked, tmp_path):
-    bake(tmp_path / "3", baked[1], 3)
-    ones, threes = (digests(folder).items() for folder in (baked[0], tmp_path / "3"))
-    assert {name for name, _ in ones ^ threes} == {"config.toml"}
+    bake(tmp_path / "2", baked[1], 2)
+    one, two = (digests(folder).items() for folder in (baked[0], tmp_path / "2"))
+    assert {name for name, _ in one ^ two} == {"config.toml"}
 
 
 def test_usd_scenes_have_props(baked):

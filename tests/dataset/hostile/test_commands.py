@@ -38,6 +38,8 @@ class Sandbox:
 
     def __init__(self, folder: Path, scratch: Path) -> None:
         self.folder, self.scratch = folder, scratch
+        self.changed = ""
+        """The file that is replaced."""
         paths = [path for path in sorted(folder.rglob("*")) if path.suffix in (".json", ".jsonl", ".toml", ".sha256")]
         self.files = [str(path.relative_to(folder)) for path in paths]
         self.kinds: dict[str, list[str]] = {}
@@ -50,7 +52,7 @@ class Sandbox:
     @contextmanager
     def replaced(self, name: str, content: bytes | None) -> Iterator[None]:
         """Replace a file, or remove it; afterwards it is as before. A merged set may share the file: it is not written to."""
-        path = self.folder / name
+        path, self.changed = self.folder / name, name
         before = path.read_bytes()
         path.unlink()
         try:
@@ -58,6 +60,7 @@ class Sandbox:
                 path.write_bytes(content)
             yield
         finally:
+            self.changed = ""
             path.unlink(missing_ok=True)
             path.write_bytes(before)
 
@@ -95,19 +98,20 @@ def hostile_content(name: str, data: bytes, number: int) -> bytes | None:
     return json.dumps(changed).encode() + b"\n" + rest
 
 
-def use_set(folder: Path) -> None:
-    """Read everything of a data set that `synpick_warp.open` gives; errors are SynpickErrors, or those of a missing key."""
-    data = synpick_warp.open(folder)
+def use_set(sandbox: Sandbox) -> None:
+    """Read everything of a data set that `synpick_warp.open` gives; errors are SynpickErrors, or those of a missing key. Arrays are read to
+    their ends if the store of one has changed."""
+    data, arrays = synpick_warp.open(sandbox.folder), "zarr" in sandbox.changed or not sandbox.changed
     attempted(lambda: (len(data), repr(data), data.config))
     attempted(lambda: (data.attributes, data.objects))
     for name in ("cameras", "models_info"):
         attempted(lambda name=name: getattr(data, name))
     attempted(lambda: list(data.attempts))
     for index in attempted(lambda: list(data)) or []:
-        use_episode(data, index)
+        use_episode(data, index, arrays)
 
 
-def use_episode(data: DataSet, index: int) -> None:
+def use_episode(data: DataSet, index: int, arrays: bool) -> None:
     """Read everything of an episode."""
     episode = attempted(lambda: data[index])
     if episode is None:
@@ -115,7 +119,7 @@ def use_episode(data: DataSet, index: int) -> None:
     attempted(lambda: (repr(episode), episode.row, len(episode)))
     attempted(lambda: episode.attributes)
     for group in (episode.ticks, episode.steps, episode.arrangement, episode.attempt_arrays):
-        for name in attempted(lambda group=group: list(group)) or []:
+        for name in (attempted(lambda group=group: list(group)) or []) if arrays else ():
             attempted(lambda name=name, group=group: group[name][...])
     names = ("rgb", "depth", "masks", "amodal_masks", "layers", "intrinsics", "object_to_world", "object_ids", "instance_ids")
     for camera in (0, 2):
@@ -183,7 +187,7 @@ def check_and_merge(sandbox: Sandbox) -> int:
 
 
 READERS: dict[str, Callable[[Sandbox], int | None]] = {
-    "open": lambda sandbox: use_set(sandbox.folder),
+    "open": use_set,
     "draw": draw,
     "evaluate": evaluate,
     "estimate": estimate,
