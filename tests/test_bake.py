@@ -31,7 +31,7 @@ from tests.builders import PICKED, STIRRING, assignments, bake_boxes, boxes, fai
 from tests.worlds.small_worlds import BRIEF, QUICK, catalog, settings
 
 EPISODES, CAMERAS = 3, 3
-WIDTH, HEIGHT = 96, 54
+WIDTH, HEIGHT = 64, 36
 TINY = STIRRING | {
     "bake.worlds": 2,
     "bake.episodes": EPISODES,
@@ -228,6 +228,7 @@ FOUR_CUPS = PICKED | {
     "gripper.cup_width": 0.03,
     "arrangement.volume": 4e-3,
     "bake.formats": ["bop", "zarr"],
+    "cameras.resolution": [32, 18],
     "render.mode": "unoccluded",
     "render.layers": [],
 }

@@ -18,24 +18,25 @@ from synpick_warp.cloud import run as cloud_run
 from synpick_warp.dataset.commit import merge, writing
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory import pipeline
+from synpick_warp.scenes.collision import simplification
 from synpick_warp.stages.render import light_tables, scene
 from synpick_warp.system.processes import isolation
 from tests.harness.charts import render_here
 
-MOST_MAPS = 50
-"""Environment maps whose tables, and TOML files whose contents, are kept."""
+MOST_MAPS, MOST_HULLS = 50, 1000
+"""Environment maps whose tables, and TOML files whose contents, are kept; and hulls of grippers, bins and boxes."""
 KERNELS = ("create_narrow_phase_kernel_gjk_mpr", "create_narrow_phase_primitive_kernel")
 """Functions by which Newton generates kernels anew for each collision pipeline."""
 
 
-def remembered(make: Callable[..., object]) -> Callable[..., object]:
+def remembered(make: Callable[..., object], most: int = MOST_MAPS) -> Callable[..., object]:
     """A function of arrays that keeps its results, by the digests of their arguments."""
     tables: dict[bytes, object] = {}
 
     def remember(*arguments: object) -> object:
         key = hashlib.sha256(pickle.dumps(arguments)).digest()
         if key not in tables:
-            if len(tables) > MOST_MAPS:
+            if len(tables) > most:
                 tables.clear()
             tables[key] = make(*arguments)
         return tables[key]
@@ -45,13 +46,14 @@ def remembered(make: Callable[..., object]) -> Callable[..., object]:
 
 @contextmanager
 def made_once() -> Iterator[None]:
-    """Tables of environment maps, content of TOML, and Newton's kernels of the narrow phase are made once a process and its forks.
+    """Tables of environment maps, hulls, content of TOML, and Newton's kernels of the narrow phase are made once a process and its forks.
 
     Files are not synchronized with the disk, as no test cuts the power: killed processes leave what they wrote.
     """
     with pytest.MonkeyPatch.context() as patch:
         for module, name in ((scene, "precompute_environment"), (light_tables, "environment_cdf")):
             patch.setattr(module, name, remembered(getattr(module, name)))
+        patch.setattr(simplification, "hull_piece", remembered(simplification.hull_piece, MOST_HULLS))
         for name in KERNELS:
             patch.setattr(narrow_phase, name, functools.cache(getattr(narrow_phase, name)))
         read = functools.lru_cache(maxsize=MOST_MAPS)(lambda text, loads=tomllib.loads: pickle.dumps(loads(text)))

@@ -29,12 +29,18 @@ ROOM = 0.02
 
 
 class EagerPhysics(Physics):
-    """Physics whose steps are launched one by one, never as a captured graph: hooks may read arrays and compute on the host."""
+    """Physics of one step a tick whose hook and watcher may read arrays and compute on the host: only what follows the hook is captured, and
+    with a watcher nothing."""
 
     def tick_parts(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
     ) -> Iterator[None]:
-        yield from self._run_substeps(before_step, after_collide, watcher)
+        if watcher is not None:
+            yield from self._run_substeps(before_step, after_collide, watcher)
+            return
+        assert self.settings.steps_per_tick == 1
+        before_step(self.state)
+        yield from super().tick_parts(lambda _: None, after_collide)
 
 
 class Hanging:
@@ -92,6 +98,7 @@ class Hanging:
         self.physics.state.joint_qd.zero_()
         self.physics.control.joint_f.zero_()
         self.physics.load(self.state.variant, self.state.restarted)
+        self.physics.clear_graphs()
         self.seals.object_in_tcp.assign(np.concatenate([place, turn], axis=2))
         self.seals.attached.fill_((1 << self.scene.cups.count) - 1)
         self.seals.break_force.fill_(break_force)
