@@ -29,7 +29,7 @@ def bake(url: str, config=None, **given):
     return run.bake_into_store(run.Job(config or tiny(), url, bake=scripted_bake.bake_episodes), QUIET, **given)
 
 
-def test_the_set_equals_a_local_one_of_every_format(prefix, tmp_path, monkeypatch):
+def test_the_set_equals_a_local_one_of_every_format(memory, tmp_path, monkeypatch):
     """Nothing is written but into the store and a temporary folder, which is gone."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
@@ -37,11 +37,11 @@ def test_the_set_equals_a_local_one_of_every_format(prefix, tmp_path, monkeypatc
         (tmp_path / name).mkdir()
     monkeypatch.chdir(tmp_path / "here")
     config = tiny(2, FORMATS)
-    assert bake(prefix, config).total == 2
+    assert bake(memory, config).total == 2
     assert [list(folder.iterdir()) for folder in tmp_path.iterdir()] == [[], [], []]
     scripted_bake.bake(tmp_path / "local", config)
-    assert stored(prefix) == files(tmp_path / "local")
-    assert bake(prefix, config).total == 0
+    assert stored(memory) == files(tmp_path / "local")
+    assert bake(memory, config).total == 0
 
 
 def test_fewer_episodes_than_are_there_leave_nothing_to_do(memory, local):
