@@ -24,7 +24,7 @@ from synpick_warp.views.layer_codec import CODECS, decode_layer, encode_layer, l
 from synpick_warp.views.layers import LAYER_TABLE
 from tests.builders import PICKING, STIRRING, bake_boxes, once
 
-WIDTH, HEIGHT = 96, 54
+WIDTH, HEIGHT = 64, 36
 TINY = STIRRING | {
     "bake.episodes": 3,
     "cameras.resolution": [WIDTH, HEIGHT],

@@ -24,7 +24,6 @@ from synpick_warp.stages.sim.worlds import AttemptState, WorldState, world_sizes
 from tests.harness.probe import probe
 from tests.twins import suction as twin
 from tests.twins.raycast import rotation_of
-from tests.worlds.hanging import EagerPhysics
 from tests.worlds.kernel_worlds import KernelWorlds
 from tests.worlds.small_worlds import CUBE, catalog, settings
 
@@ -189,24 +188,35 @@ SMOOTH, FOUND = 5, 200
 
 
 class CupContacts:
-    """Watcher of physics: the sum of the forces of all contacts on each cup, in each substep (substep, world, 3) [N]."""
+    """Watcher of physics: copies, in each substep, of contacts and of the forces that the solver tells of."""
 
     def __init__(self, physics: Physics) -> None:
-        self.physics, self.forces = physics, []
+        self.physics, self.copies, self.substep = physics, [], 0
 
     def begin_step(self) -> None:
-        self.forces = []
+        self.substep = 0
 
     def after_solve(self, contact_f: wp.array) -> None:
-        """The solver tells of the force on shape 0."""
-        layout, contacts = self.physics.layout, self.physics.contacts
-        count = int(contacts.rigid_contact_count.numpy()[0])
-        total = np.zeros((layout.worlds, 3))
-        for array, sign in ((contacts.rigid_contact_shape0, 1.0), (contacts.rigid_contact_shape1, -1.0)):
-            shape = array.numpy()[:count]
-            cup = np.isin(shape % layout.shapes_per_world, layout.head_shapes)
-            np.add.at(total, shape[cup] // layout.shapes_per_world, sign * contact_f.numpy()[:count, :3][cup])
-        self.forces.append(total)
+        """A replay copies into the same arrays."""
+        contacts = self.physics.contacts
+        told = (contacts.rigid_contact_count, contacts.rigid_contact_shape0, contacts.rigid_contact_shape1, contact_f)
+        if self.substep == len(self.copies):
+            self.copies.append([wp.empty_like(array) for array in told])
+        for array, copy in zip(told, self.copies[self.substep], strict=True):
+            wp.copy(copy, array)
+        self.substep += 1
+
+    def forces(self) -> list[np.ndarray]:
+        """Sum of the forces of all contacts on each cup, in each substep (substep, world, 3) [N]; the solver tells of that on shape 0."""
+        layout, totals = self.physics.layout, []
+        for count, first, second, force in self.copies:
+            total, used = np.zeros((layout.worlds, 3)), int(count.numpy()[0])
+            for array, sign in ((first, 1.0), (second, -1.0)):
+                shape = array.numpy()[:used]
+                cup = np.isin(shape % layout.shapes_per_world, layout.head_shapes)
+                np.add.at(total, shape[cup] // layout.shapes_per_world, sign * force.numpy()[:used, :3][cup])
+            totals.append(total)
+        return totals
 
     def end_step(self, step: int, current: newton.State) -> None:
         """Nothing more."""
@@ -224,7 +234,7 @@ def driven(device) -> SimpleNamespace:
     `force` of the impedance law, `setpoint`, and `contact` with an axis of substeps before the world's."""
     config = settings(bake__worlds=WORLDS, physics__steps_per_tick=1, move__speed=0.4, arrangement__max_objects=1)
     built = build.build_model(config, catalog(CUBE), device)
-    physics, layout, tip = EagerPhysics(config.physics, built), built.layout, config.gripper.cup_length
+    physics, layout, tip = Physics(config.physics, built), built.layout, config.gripper.cup_length
     scene = make_scene_data(config, catalog(CUBE), built, 1, device)
     sizes = world_sizes(WORLDS, layout.instances, config.move.rounds, layout.bodies_per_world, len(built.head.cups))
     state, attempts, plan = (allocate(kind, sizes, device) for kind in (WorldState, AttemptState, Plan))
@@ -267,7 +277,7 @@ def driven(device) -> SimpleNamespace:
         arrays = (physics.state.joint_q, physics.state.joint_qd, physics.control.joint_f)
         place, speed, force = (array.numpy().reshape(WORLDS, -1).astype(float) for array in arrays)
         weight = [0.0, 0.0, scene.move.mass * config.physics.gravity]
-        rows.append((place[:, :3] - start, place[:, 3], speed[:, :3], force[:, :3] - weight, state.setpoint.numpy().copy(), watcher.forces))
+        rows.append((place[:, :3] - start, place[:, 3], speed[:, :3], force[:, :3] - weight, state.setpoint.numpy().copy(), watcher.forces()))
     names = ("position", "tilt", "velocity", "force", "setpoint", "contact")
     columns = dict(zip(names, (np.array(column, float) for column in zip(*rows, strict=True)), strict=True))
     return SimpleNamespace(config=config, start=start, **columns)

@@ -28,19 +28,15 @@ ROOM = 0.02
 """Volume for one object [m³]."""
 
 
-class EagerPhysics(Physics):
-    """Physics of one step a tick whose hook and watcher may read arrays and compute on the host: only what follows the hook is captured, and
-    with a watcher nothing."""
+class HookedPhysics(Physics):
+    """Physics of one step a tick whose hook may read arrays and compute on the host: what follows it is captured."""
 
     def tick_parts(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
     ) -> Iterator[None]:
-        if watcher is not None:
-            yield from self._run_substeps(before_step, after_collide, watcher)
-            return
         assert self.settings.steps_per_tick == 1
         before_step(self.state)
-        yield from super().tick_parts(lambda _: None, after_collide)
+        yield from super().tick_parts(lambda _: None, after_collide, watcher)
 
 
 class Hanging:
@@ -67,7 +63,7 @@ class Hanging:
         self.inertia = np.stack([entry.inertia for entry in entries]).reshape(self.worlds, self.instances, 3, 3)
         objects = Catalog(entries)
         built = build.build_model(self.config, objects, device)
-        self.layout, self.physics = built.layout, EagerPhysics(self.config.physics, built)
+        self.layout, self.physics = built.layout, HookedPhysics(self.config.physics, built)
         self.scene = make_scene_data(self.config, objects, built, 1, device)
         sizes = (self.worlds, self.instances, self.config.move.rounds, built.layout.bodies_per_world, len(built.head.cups))
         extents = world_sizes(*sizes)
