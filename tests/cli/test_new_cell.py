@@ -3,6 +3,7 @@
 import itertools
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from synpick_warp.apps.viz import cell
 from synpick_warp.apps.viz.frusta import project
 from synpick_warp.cli.commands import new_cell
 from synpick_warp.configs.cell.cameras import intrinsics
@@ -58,6 +60,7 @@ def drawn(monkeypatch) -> list[str]:
 
 
 def test_a_cell_without_options_is_complete(tmp_path, monkeypatch):
+    monkeypatch.setattr(cell, "scaled_down", partial(cell.scaled_down, most=96))
     monkeypatch.chdir(tmp_path)
     ran = run("new-cell", "CELL")
     assert ran.code == 0, ran.err

@@ -278,9 +278,7 @@ def test_upright_walls_need_no_other_keys(tmp_path):
     assert (measured.yaw, measured.floor, measured.openings) == (None, None, None)
 
 
-@pytest.mark.parametrize(
-    ("angle", "yaw", "flip"), [(3, 3, False), (30, 30, True), (90, None, False), (100, -80, True)]
-)
+@pytest.mark.parametrize(("angle", "yaw", "flip"), [(3, 3, False), (30, 30, True), (90, None, False), (100, -80, True)])
 def test_a_turned_bin_has_its_own_sides(tmp_path, angle, yaw, flip):
     """Its frame lies along them; in the world it is where the mesh is."""
     mesh = frustum(drafts=UNEQUAL).apply_transform(TURN(np.radians(angle), AROUND_Z)).apply_translation((0.3, -0.2, 0.5))

@@ -277,7 +277,9 @@ def driven(device) -> SimpleNamespace:
         arrays = (physics.state.joint_q, physics.state.joint_qd, physics.control.joint_f)
         place, speed, force = (array.numpy().reshape(WORLDS, -1).astype(float) for array in arrays)
         weight = [0.0, 0.0, scene.move.mass * config.physics.gravity]
-        rows.append((place[:, :3] - start, place[:, 3], speed[:, :3], force[:, :3] - weight, state.setpoint.numpy().copy(), watcher.forces()))
+        rows.append(
+            (place[:, :3] - start, place[:, 3], speed[:, :3], force[:, :3] - weight, state.setpoint.numpy().copy(), watcher.forces())
+        )
     names = ("position", "tilt", "velocity", "force", "setpoint", "contact")
     columns = dict(zip(names, (np.array(column, float) for column in zip(*rows, strict=True)), strict=True))
     return SimpleNamespace(config=config, start=start, **columns)
