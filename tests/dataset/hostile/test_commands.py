@@ -38,8 +38,7 @@ class Sandbox:
 
     def __init__(self, folder: Path, scratch: Path) -> None:
         self.folder, self.scratch = folder, scratch
-        self.changed = ""
-        """The file that is replaced."""
+        self.changed = ""  # The file that is replaced.
         paths = [path for path in sorted(folder.rglob("*")) if path.suffix in (".json", ".jsonl", ".toml", ".sha256")]
         self.files = [str(path.relative_to(folder)) for path in paths]
         self.kinds: dict[str, list[str]] = {}
