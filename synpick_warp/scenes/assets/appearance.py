@@ -303,7 +303,7 @@ def clamp_texture(texture: Any, uv: np.ndarray, axes: tuple[bool, bool], ignored
 def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: str, said: list[str]) -> tuple[list[np.ndarray], np.ndarray]:
     """Merge the materials of several parts into one texture atlas, with base colour factors multiplied in. `parts`: texture coordinates (V,
     2) in 0..1, or None, and the material, of each part. `said`: warnings are added to it. Returns new texture coordinates of each part, one
-    row (1, 2) for parts without a texture; and the atlas (H, W, C) uint8. Raises CatalogError: the atlas is too large."""
+    row (1, 2) for parts without texture and anisotropy; and the atlas (H, W, C) uint8. Raises CatalogError: the atlas is too large."""
     places: dict[tuple[int, tuple[float, ...]], int] = {}
     blocks, index = [], []
     for uv, material in parts:
@@ -322,7 +322,7 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
         atlas[top : top + block.shape[0], block.shape[1] :, 3:] = block[:, -1:, 3:]
     uvs = []
     for (uv, material), place in zip(parts, index, strict=True):
-        uv = np.full((1, 2), 0.5) if uv is None or material.texture is None else uv
+        uv = np.full((1, 2), 0.5) if uv is None or (material.texture is None and not material.finish.anisotropy) else uv
         rows, columns = blocks[place].shape[:2]
         # At least half a texel from the block's border, so that filtering does not bleed.
         column = np.clip(uv[:, 0] * columns, 0.5, columns - 0.5)

@@ -54,10 +54,11 @@ def read_finish(
     return Finish(factor, roughness if factor else 0.0, strength, float(values[3]) if strength else 0.0)
 
 
+@np.errstate(invalid="ignore")
 def brush_coordinates(vertices: np.ndarray, given: np.ndarray | None) -> np.ndarray:
     """Texture coordinates (V, 2), v up, of an anisotropic material without textures: those `given`, v down. Without them u is around the y
-    axis, which is up in glTF, and v along it: highlights stretch horizontally, and along x on a surface that faces up."""
-    if given is not None:
-        return np.stack([given[:, 0], 1.0 - given[:, 1]], axis=1)
+    axis, which is up in glTF, and v along it: highlights stretch horizontally, and along x on a surface that faces up. They are scaled to
+    0.25..0.75, which changes no direction, so that they stay in the part's block of a texture atlas."""
     x, y, z = vertices.T
-    return np.stack([np.arctan2(x, z).round(DECIMALS) / (2.0 * np.pi), y - _TILT * z], axis=1)
+    uv = np.stack([np.arctan2(x, z).round(DECIMALS), y - _TILT * z], axis=1) if given is None else given * (1.0, -1.0)
+    return 0.5 + 0.25 * uv / np.abs(uv).max(axis=0, initial=np.finfo(np.float64).tiny)
