@@ -1,6 +1,7 @@
 """Bins from meshes: what is measured, that collision shapes fill the solid and nothing free, and what is refused."""
 
 import dataclasses
+import hashlib
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from synpick_warp.configs.cell.bins import AXES, BinRow, BinSizes, MeasuredBin
 from synpick_warp.configs.files.load import config_to_toml, load_config, override_config
 from synpick_warp.dataset.commit.manifest import make_manifest
 from synpick_warp.errors import ConfigError
+from synpick_warp.scenes.assets.appearance import NO_MATERIAL
 from synpick_warp.scenes.bin_meshes import reading
 from synpick_warp.scenes.bin_meshes.colliders import MAX_PIECES
 from synpick_warp.scenes.bin_meshes.inside import LIMIT_CELLS, _flood
@@ -18,6 +20,7 @@ from synpick_warp.scenes.bin_meshes.reading import BinModel, measure_bins, read_
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.collision.simplification import hull_piece
 from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.types import Finish, TriangleMesh
 from tests.harness.pieces import filled
 from tests.worlds import bin_meshes as meshes
 from tests.worlds.bin_meshes import block, frustum, heights, sloped_bin, stepped_bin
@@ -51,6 +54,18 @@ def read_sizes(tmp_path, mesh, name: str = "own.stl", **settings) -> tuple[BinMo
 def opening_of(drafts) -> list[float]:
     """Sides of the opening of a `frustum`."""
     return list(np.array(FLOOR) + HEIGHT * np.tan(np.radians(drafts)).reshape(2, 2).sum(axis=1))
+
+
+def test_a_checksum_tells_materials_apart():
+    """Bins as they were before files had light and coats keep theirs."""
+    solid = trimesh.creation.box((1.0, 1.0, 1.0))
+    mesh = TriangleMesh(solid.vertices, solid.faces, solid.vertex_normals, np.zeros((len(solid.vertices), 2)))
+    materials = [dataclasses.replace(NO_MATERIAL, **each) for each in ({}, {"finish": Finish(0.5)}, {"emission": (1.0, 0.0, 0.0)})]
+    assert len({reading._checksum(mesh, each) for each in materials}) == 3
+    state = hashlib.sha256(repr((NO_MATERIAL.color, None, None)).encode())
+    for array in (mesh.vertices, mesh.faces, mesh.normals, mesh.uv):
+        state.update(np.ascontiguousarray(array).tobytes())
+    assert reading._checksum(mesh, NO_MATERIAL) == state.hexdigest()
 
 
 def test_a_sloped_floor_and_a_divider_are_measured_and_have_shapes(tmp_path):

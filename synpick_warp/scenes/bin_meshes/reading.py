@@ -25,7 +25,7 @@ from synpick_warp.scenes.bin_meshes.compartments import (
     turned,
 )
 from synpick_warp.scenes.bin_meshes.inside import MIN_DEPTH, BinSurface, HeightField, find_inside, make_limits
-from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
+from synpick_warp.scenes.types import BLACK, PLAIN, ConvexPiece, Material, TriangleMesh
 from synpick_warp.system.linear_algebra import matmul
 
 SIDES = (0.02, 10.0)
@@ -174,7 +174,8 @@ def _rounded(values: np.ndarray | tuple[float, ...]) -> tuple:
 
 def _checksum(mesh: TriangleMesh, material: FileMaterial) -> str:
     """SHA-256 of a mesh in the bin's frame and of its material."""
-    state = hashlib.sha256(repr((material.color, material.metallic, material.roughness)).encode())
+    added = [value for value, none in ((material.light, BLACK), (material.finish, PLAIN)) if value != none]
+    state = hashlib.sha256(repr((material.color, material.metallic, material.roughness, *added)).encode())
     for array in (mesh.vertices, mesh.faces, mesh.normals, mesh.uv, material.texture):
         state.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
     return state.hexdigest()
