@@ -40,11 +40,11 @@ def with_capacities(physics: Physics, count: int, catalog: Catalog, bins: Sequen
     """Raise the capacities of a world of at most `count` objects if these are many, or some are thinner than the contact margin, so touch
     through others, or if bins have more shapes beside an object than a box has.
 
-    The margin of two shapes is twice `physics.gap`. Within a margin m of an object of side lengths a, b, c there is room for about (a + 2
-    m)(b + 2 m)(c + 2 m) / (a b c) - 1 others of its kind: 23 for plates of 100 x 80 x 1 mm. Up to FEW objects that are thicker than the
-    margin keep the capacities of the settings. Many have contacts in proportion to their number, and three rows for each, so that rows
-    cannot run out before contacts do. `count`: capacity for objects of a world. `bins`: the bins; without any, walls and floor of a box are
-    counted. `counts`: `arrangement.counts`; the remaining room of `count` is for distractors."""
+    The margin of a fast shape and a fixed one is twice `physics.gap`; at rest it is less. Within a margin m of an object of side lengths
+    a, b, c there is room for about (a + 2 m)(b + 2 m)(c + 2 m) / (a b c) - 1 others of its kind: 23 for plates of 100 x 80 x 1 mm. Up to
+    FEW objects that are thicker than the margin keep the capacities of the settings. Many have contacts in proportion to their number, and
+    three rows for each, so that rows cannot run out before contacts do. `count`: capacity for objects of a world. `bins`: the bins; without
+    any, walls and floor of a box are counted. `counts`: `arrangement.counts`; the remaining room of `count` is for distractors."""
     margin, needed = 2.0 * physics.gap, 0.0
     reach = float(np.mean([entry.radius for entry in catalog.bodies])) + margin
     shapes = max((_count_beside(one, reach) for one in bins if one.is_detailed), default=_FIXTURES)

@@ -93,7 +93,7 @@ def test_depth_of_contacts(device):
 
 
 def test_contact_margins_cover_the_motion_of_a_substep(device):
-    """Points of shapes of moving bodies, against their velocities v + ω x r; a static shape, and one too fast, have the bounds."""
+    """Points of shapes of moving bodies, against their velocities v + ω x r. Bounds hold for a static shape, one too fast, and NaN."""
     random, count, duration, least, most = np.random.default_rng(3), 200, 2e-3, 5e-4, 4e-3
     body = np.arange(count) - 1  # The first shape is static.
     place, center = (random.normal(0.0, 0.05, (count, 3)) for _ in range(2))
@@ -111,6 +111,9 @@ def test_contact_margins_cover_the_motion_of_a_substep(device):
     assert (found >= np.minimum(least + moved[1:], most) - 1e-8).all()
     assert 0.1 < (found == np.float32(most)).mean() < 0.9
     assert np.median((found - least)[found < np.float32(most)] / moved[1:][found < np.float32(most)]) < 3.0
+    inputs[-1].assign(np.where(np.arange(6) == np.arange(count)[:, None] % 6, np.nan, twist))
+    wp.launch(rest.set_gaps_kernel, dim=count, inputs=inputs, outputs=[gap], device=device)
+    assert (gap.numpy()[1:] == np.float32(most)).all()
 
 
 def test_contacts_beyond_the_count_do_not_exist(device):

@@ -89,7 +89,7 @@ def list_awake_pairs_kernel(
 def wake_touched_kernel(layout: LayoutData, threads: int, contacts: Contacts, sleepers: Sleepers, islands_out: Islands):
     """Mark the sleeping islands in contact with an awake body: `woken` becomes 1 at the slot that names the island (`island`).
 
-    Contacts begin at twice the contact margin, so that islands wake before surfaces meet. Grid-stride loop, launched over `threads`.
+    Contact margins cover the motion in a substep, so that islands wake before surfaces meet. Grid-stride loop, launched over `threads`.
     """
     thread = wp.tid()
     for contact in range(thread, wp.min(contacts.count[0], contacts.shape0.shape[0]), threads):

@@ -37,7 +37,7 @@ DEPTHS = (2, 3, 4, 3)
 MAX_NORM = 5.0
 """Norm to which gradients are clipped."""
 SHARPENING = 2.5
-"""Largest weight of unsharp masking: halos of edges, and the grain of flat blocks at half size, are as in unlabelled photographs (medians)."""
+"""Largest weight of unsharp masking: halos, and the grain of flat blocks at half size, have the medians of unlabelled photographs."""
 FIRST = 0.125
 """Fraction of the pool that is filled before training starts."""
 FILLING = 0.5
