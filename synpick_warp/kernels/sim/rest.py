@@ -219,8 +219,8 @@ def set_gaps_kernel(
     """Speculative contact margins: `gap_out` receives `least`, and the bound (|v| + |ω| r) Δt on the path of the shape's points in a
     substep of the given duration [s], but `most` at most. Launched over shape.
 
-    Two shapes have contacts up to the sum of their margins, so before they can touch. Contacts beyond that carry no impulse, but each is a
-    constraint row, and those of one body are solved one after the other.
+    Two shapes have contacts up to the sum of their margins, so before they touch, unless one is hit in that substep: by a cube at 3.9 m/s a
+    cube 1 mm above the floor was driven 2.8 mm into it. More contacts carry no impulse, but the rows of one body are solved one by one.
     """
     shape = wp.tid()
     body = shape_body[shape]
