@@ -69,7 +69,7 @@ class RenderScene:
     table: Any
     """The struct `Table`."""
     paths: Any
-    """The struct `PathScene`, or `RandomizedScene`: all of the above that path tracing reads."""
+    """The struct `PathScene`, or a variant (`AnyScene`): all of the above that path tracing reads."""
     plain: Any
     """The struct `PathScene`, for kernels that read no materials of views."""
     grid: Any

@@ -104,13 +104,13 @@ def repeat_texture(surfaces: AnySurfaces, surface: Surface) -> Surface:  # noqa:
 
 @wp.func
 def has_tangent(surfaces: AnySurfaces, row: int) -> bool:
-    """Whether a material needs tangents: it has a normal map, or is anisotropic."""
+    """Whether a material needs tangents: it has a normal map."""
     return (surfaces.maps[row] & NORMAL_MAP) != 0
 
 
 @wp.func
 def has_tangent(surfaces: FinishedSurfaces, row: int) -> bool:  # noqa: F811
-    """Whether a material needs tangents."""
+    """Whether a material needs tangents: it has a normal map, or is anisotropic."""
     return (surfaces.maps[row] & NORMAL_MAP) != 0 or surfaces.finish[row][2] > 0.0
 
 

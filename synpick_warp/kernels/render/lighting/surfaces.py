@@ -96,8 +96,8 @@ body's material (view, body, then the table and the floor), `recolor` the matrix
 clamped to 0..1, and `repeats` the factor on its texture coordinates; `wear` are the amounts of `lighting.wear`, whose noise is the
 table `noise`, in a part that the seed `pattern` draws; `glass` is transmission, index of refraction, and thickness [m]; `label` the place
 of the body's label, whose print has the same seed; `emission` is the light that it emits, in units of the white of a picture, and `glow`
-(texel) a factor on it, packed as `texel`; `finish` are clearcoat, its roughness, anisotropy and its rotation [rad], which
-`FinishedSurfaces` alone have."""
+(texel) a factor on it, packed as `texel`; `finish` are clearcoat, its roughness, anisotropy and its rotation [rad], read of
+`FinishedSurfaces` alone."""
 FinishedSurfaces = variant_of(RandomizedSurfaces, "FinishedSurfaces")
 AnySurfaces = Any
 """`Surfaces`, `RandomizedSurfaces` or `FinishedSurfaces`: functions are compiled for each; see `variants`."""
