@@ -20,7 +20,7 @@ from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Move,
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField
 from synpick_warp.scenes.bins import TABLE_SIZE, guide_walls, make_bins
-from synpick_warp.scenes.capacities import count_entries
+from synpick_warp.scenes.capacities import count_entries, oriented_sides
 from synpick_warp.scenes.grippers import CUP_ARMATURE, GRIPPER_BODIES, GRIPPER_DOFS, Head, finger_collider, make_head, rod_inertia
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
 
@@ -29,6 +29,8 @@ EMPTY_MASS = 0.1
 EMPTY_INERTIA = 1e-3
 # Monte Carlo trials that determine the slot counts; a fraction of 1e-3 of them is known to 10 %.
 SLOT_TRIALS = 100_000
+# Contact margin of a shape at rest [m]: far above the depth of contacts at rest, 0.1 mm.
+REST_GAP = 5e-4
 FREE_COORDS = 7
 FREE_DOFS = 6
 
@@ -94,6 +96,8 @@ class BuiltModel:
     """Index of the empty variant in single and in compound slots."""
     fields: tuple[HeightField | None, ...]
     """Height field of the inside of each bin."""
+    rest_gap: float
+    """Contact margin of a shape at rest [m]."""
 
 
 REPEATS: Mapping[str, object] = {"pick.repeats": True, "move.repeats": True}
@@ -221,7 +225,8 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         world.add_shape_convex_hull(-1, xform=pose, mesh=hull_mesh(piece), cfg=shape)
     head = make_head(config.gripper)
     gripper = add_gripper(world, config.gripper, head, shape)
-    variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound), find_drawn(config.arrangement, catalog))
+    drawn = find_drawn(config.arrangement, catalog)
+    variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound), drawn)
     scene = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(scene)
     scene.replicate(world, copy_count=config.bake.worlds)
@@ -230,7 +235,14 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         warnings.filterwarnings("ignore", "Eigenvalues below threshold")
         model = scene.finalize(device=device)
     layout = WorldLayout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, tuple(parts), *gripper)
-    return BuiltModel(model, layout, head, variant, empty, tuple(one.limits for one in bins))
+    return BuiltModel(model, layout, head, variant, empty, tuple(one.limits for one in bins), find_rest_gap(config.physics, catalog, drawn))
+
+
+def find_rest_gap(physics: Physics, catalog: Catalog, drawn: np.ndarray) -> float:
+    """Contact margin of a shape at rest [m]: REST_GAP, or that of a fast one, if one of the objects `drawn` is thinner than two of these.
+    It would pass through another of its kind when hit, as its margin does not know of the impact."""
+    is_thin = any(oriented_sides(catalog.bodies[index].pieces).min() < 2.0 * physics.gap for index in drawn.tolist())
+    return physics.gap if is_thin else min(REST_GAP, physics.gap)
 
 
 def find_drawn(arrangement: Arrangement, catalog: Catalog) -> np.ndarray:

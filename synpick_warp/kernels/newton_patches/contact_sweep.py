@@ -1,7 +1,7 @@
 """Colored Gauss-Seidel sweep over the contacts of a world by one warp, which loads 32 contacts at a time into registers.
 
 Newton's SolverSteel loads the contacts of one color, solves them, and goes on with the next color. Piles have many colors of few contacts:
-an object of many convex pieces lies on the tote with 60 contacts, each of a color of its own, and each color waits for memory. Here each
+an object of many convex pieces lies on the tote with 20 contacts, each of a color of its own, and each color waits for memory. Here each
 lane loads one of 32 contacts, consecutive in the order of colors, and the colors among them are solved one after the other. Meanwhile the
 next 32 are prefetched. The arithmetic is the solver's, bit by bit, but for the friction rows (`friction`).
 """

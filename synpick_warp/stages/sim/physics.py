@@ -27,8 +27,6 @@ from synpick_warp.system.hardware.cores import is_only_launcher
 ENDED = object()
 # Contacts with a larger gap get no constraint rows [m]. The collision pipeline finds none that far apart: a hook disables a contact so.
 CONTACT_GAP = 0.1
-# Contact margin of a shape at rest [m]: far above the depth of contacts at rest, 0.1 mm, and what gravity adds in a substep.
-REST_GAP = 5e-4
 # Distance to a joint limit from which its constraint row is active [rad].
 JOINT_LIMIT_GAP = 0.2
 # Fraction of its speed limit from which a body has velocity limit rows. Six idle rows for each body at all times would take a third
@@ -91,7 +89,7 @@ class Physics:
     """
 
     def __init__(self, settings: PhysicsConfig, built: build.BuiltModel) -> None:
-        self.settings = settings
+        self.settings, self._rest_gap = settings, built.rest_gap
         self.layout = built.layout
         self.model = built.model
         self.device = self.model.device
@@ -226,7 +224,8 @@ class Physics:
     def _set_gaps(self, state: newton.State) -> None:
         """Set the contact margins of all shapes by the speeds of their bodies."""
         physics, model = self.settings, self.model
-        margins = [min(REST_GAP, physics.gap), 2.0 * physics.gap, physics.step / physics.substeps]
+        duration = physics.step / physics.substeps
+        margins = [self._rest_gap, 2.0 * physics.gap - self._rest_gap, duration, duration * physics.gravity]
         inputs = [*margins, model.shape_body, model.shape_transform, model.shape_collision_radius, model.body_com, state.body_qd]
         wp.launch(rest.set_gaps_kernel, dim=model.shape_count, inputs=inputs, outputs=[model.shape_gap], device=self.device)
 
