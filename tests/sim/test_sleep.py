@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.codes import Outcome, Phase, Removal, Task
+from synpick_warp.codes import Outcome, Phase, Removal
 from synpick_warp.errors import SynpickError
 from synpick_warp.kernels.sim import sleep as kernels
 from synpick_warp.kernels.state import Contacts
@@ -121,21 +121,19 @@ def test_a_stack_is_an_island(twins):
 
 
 def test_a_pick_from_a_sleeping_pile_ends_as_from_an_awake_one(twins):
-    """The pressed object wakes, the seal holds, and all others come to rest where they do in the awake twin."""
-    angle = instance_of(twins, ANGLE)
-    pressed, seen, peak = [], dict[int, tuple[int, Outcome]](), np.zeros(2)
+    """The picked object is awake, and all others rest where they do in the awake twin."""
+    cube = instance_of(twins, CUBE)
+    seen, peak = dict[int, tuple[int, Outcome]](), np.zeros(2)
     for tick in range(ATTEMPT):
         twins.tick()
         now = report(twins.record)
         peak = np.maximum(peak, now.measure("peak_force")[:2])
-        if twins.attempts.task.numpy()[0] == Task.PRESS:
-            pressed.append(asleep(twins)[0])
         for world in (0, 1):
             if tick and now.column("outcome")[world]:  # Before the first look, attempts without a plan fail.
                 seen.setdefault(world, (tick, Outcome(now.column("outcome")[world])))
         if len(seen) == 2:
             break
-    assert pressed[-1].tolist() == [instance == angle for instance in range(3)]
+    assert asleep(twins)[0].tolist() == [instance != cube for instance in range(3)]
     assert seen[0] == seen[1]
     assert seen[0][1] is Outcome.TARGET_PICKED
     assert peak[0] == pytest.approx(peak[1], rel=0.1)
