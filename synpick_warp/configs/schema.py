@@ -166,7 +166,7 @@ class Physics:
         "for three ticks are not simulated until one is touched, and lack contact forces in records.",
     )
     friction: Annotated[float, "[0, 10]"] = setting(0.5, "Coulomb friction coefficient of every shape.")
-    gap: Annotated[float, "[0, 0.1] m"] = setting(4e-3, "Fast shapes have contacts below twice this distance, resting ones below 1 mm.")
+    gap: Annotated[float, "[0, 0.1] m"] = setting(4e-3, "Fast or thin objects have contacts below twice this, others at rest below 1 mm.")
     angular_damping: Annotated[float, "[0, 1e3] 1/s"] = setting(0.05, "Angular damping of the objects (PhysX's default).")
     max_speed: Annotated[float, "(0, 100] m/s"] = setting(
         4.0, "Speed limit of the objects; above twice the gap per substep they may tunnel."

@@ -136,7 +136,8 @@ def launch_views(
 
 
 def _launch_pieces(kernel: wp.Kernel, starts: range, end: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
-    """Launch a kernel over the threads from each of `starts` to the next one or `end`, several in a thread pool."""
+    """Launch a kernel in consecutive ranges of threads that begin at `starts`, the last of which ends at `end`; by a thread pool if there
+    are several."""
     kernel = kernel_for(kernel, *inputs)
 
     def launch_piece(first: int) -> None:

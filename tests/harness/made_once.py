@@ -1,4 +1,4 @@
-"""Memory of what takes most of the time to build small worlds, and follows from its arguments alone; and no wait for disks."""
+"""Memoization of pure functions that dominate the set-up of small worlds, and test doubles for disk flushes and subprocesses."""
 
 import functools
 import hashlib
@@ -24,13 +24,13 @@ from synpick_warp.system.processes import isolation
 from tests.harness.charts import render_here
 
 MOST_MAPS, MOST_HULLS = 50, 1000
-"""Environment maps whose tables, and TOML files whose contents, are kept; and hulls of grippers, bins and boxes."""
+"""Maximum number of cached environment tables or parsed TOML files, and of cached convex hulls."""
 KERNELS = ("create_narrow_phase_kernel_gjk_mpr", "create_narrow_phase_primitive_kernel")
-"""Functions by which Newton generates kernels anew for each collision pipeline."""
+"""Newton's kernel factories, which generate new kernels for each collision pipeline."""
 
 
 def remembered(make: Callable[..., object], most: int = MOST_MAPS) -> Callable[..., object]:
-    """A function of arrays that keeps its results, by the digests of their arguments."""
+    """Memoize a function of arrays; the cache is keyed by the digest of the arguments, and cleared above `most` entries."""
     tables: dict[bytes, object] = {}
 
     def remember(*arguments: object) -> object:
@@ -46,9 +46,9 @@ def remembered(make: Callable[..., object], most: int = MOST_MAPS) -> Callable[.
 
 @contextmanager
 def made_once() -> Iterator[None]:
-    """Tables of environment maps, hulls, content of TOML, and Newton's kernels of the narrow phase are made once a process and its forks.
+    """Cache environment tables, convex hulls, parsed TOML and Newton's narrow-phase kernels for the life of a process; forks inherit them.
 
-    Files are not synchronized with the disk, as no test cuts the power: killed processes leave what they wrote.
+    Files are not flushed to the disk, as no test simulates a power failure here: what a killed process wrote remains.
     """
     with pytest.MonkeyPatch.context() as patch:
         for module, name in ((scene, "precompute_environment"), (light_tables, "environment_cdf")):

@@ -189,7 +189,7 @@ ROWS = 'preset = "smoke"\n[bins]\nkind = "own"\n[[bin]]\nname = "kanban"\nfile =
 
 
 def read(tmp_path, text=ROWS, mesh=None):
-    """Settings with a mesh in a folder beside them, of the first call for all."""
+    """Load settings whose bin is a mesh in a folder beside them. `mesh` is written by the first call only."""
     (tmp_path / "bins").mkdir(exist_ok=True)
     if not (tmp_path / "bins" / "kanban.stl").exists():
         (mesh or sloped_bin()).export(tmp_path / "bins" / "kanban.stl")

@@ -41,7 +41,7 @@ def test_textures_count_by_their_means(tmp_path):
 
 
 def directions(mesh) -> np.ndarray:
-    """Unit vectors (F, 3) along which only u grows; zero where it is constant."""
+    """Unit tangents of the triangles (F, 3): u increases along them and v is constant. Zero where u is constant."""
     (edge, other), (b, c) = (np.moveaxis(np.diff(each[mesh.faces], axis=1), 1, 0) for each in (mesh.vertices, mesh.uv))
     along = np.sign(b[:, :1] * c[:, 1:] - b[:, 1:] * c[:, :1]) * (c[:, 1:] * edge - b[:, 1:] * other)
     return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
@@ -49,7 +49,7 @@ def directions(mesh) -> np.ndarray:
 
 @pytest.mark.parametrize("other", [{"baseColorFactor": [0.1, 0.1, 0.1, 1.0]}, {"metallicFactor": 0.0}])
 def test_a_part_in_an_atlas_keeps_its_directions(tmp_path, other):
-    """Beside a part of another colour, or of another value, all get a texture."""
+    """Parts that differ in colour or in metalness are joined by a texture atlas, which replaces texture coordinates."""
     alone = finished({}, BRUSHED).read(tmp_path)[0]
     mixed = finished({}, BRUSHED).with_(nodes=[{"mesh": 0, "scale": [2, 2, 2]}, {"mesh": 1}], scenes=[{"nodes": [0, 1]}])
     mixed.content["meshes"].append({"primitives": [{**mixed.primitive, "material": 1}]})
@@ -65,7 +65,7 @@ def test_anisotropic_surfaces_keep_or_get_coordinates(tmp_path):
     textured = finished({}, BRUSHED, **pbr(**TEXTURE)).image().attribute("TEXCOORD_0", UV).read(tmp_path)[0]
     np.testing.assert_allclose(directions(mesh), directions(textured), atol=1e-6)
     assert np.ptp(finished({}, BRUSHED).read(tmp_path)[0].uv, axis=0).min() > 0.0
-    # The direction of equal v is horizontal, or along x where a surface faces up.
+    # Generated coordinates: lines of constant v are horizontal on a vertical surface, and parallel to x on one that faces up.
     front, top = (
         np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]),
         np.array([[1.0, 0.0, 1.0], [2.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),

@@ -23,13 +23,13 @@ Size = tuple[float, float, float]
 HEIGHT = 1.0
 """Height of the wrist at the start [m]: far above the tote."""
 COARSE = {"physics__steps_per_tick": 1, "physics__iterations": 4, "physics__rows_per_world": 96, "physics__contacts_per_world": 48}
-"""A step at a time, and no more room than bodies in the air need."""
+"""Overrides: one step per tick, and the small capacities that suffice for bodies in the air."""
 ROOM = 0.02
 """Volume for one object [m³]."""
 
 
 class HookedPhysics(Physics):
-    """Physics of one step a tick whose hook may read arrays and compute on the host: what follows it is captured."""
+    """Physics with one step per tick, whose `before_step` callback may compute on the host: it runs before the captured graph."""
 
     def tick_parts(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None

@@ -222,7 +222,7 @@ class Physics:
         )
 
     def _set_gaps(self, state: newton.State) -> None:
-        """Set the contact margins of all shapes by the speeds of their bodies."""
+        """Set the contact margins of all shapes by the speeds of their bodies; a fast one and one at rest sum to twice the gap at most."""
         physics, model = self.settings, self.model
         duration = physics.step / physics.substeps
         margins = [self._rest_gap, 2.0 * physics.gap - self._rest_gap, duration, duration * physics.gravity]

@@ -88,8 +88,8 @@ def test_without_coat_and_strength_it_is_the_plain_brdf(tables):
 
 
 def gltf_lobe(half, outgoing, incoming, roughness, strength):
-    """D V of KHR_materials_anisotropy, section "Implementation", times the cosine of the light, for components along tangent, bitangent,
-    normal."""
+    """Anisotropic GGX lobe D V cos θ of KHR_materials_anisotropy (section "Implementation"); directions are in the tangent frame: tangent,
+    bitangent, normal."""
     narrow = roughness**2
     wide = narrow + (1.0 - narrow) * strength**2
     area = wide * narrow
@@ -101,7 +101,7 @@ def gltf_lobe(half, outgoing, incoming, roughness, strength):
 
 @pytest.mark.parametrize("strength", [0.4, 0.8])
 def test_the_lobe_is_that_of_gltf(tables, strength):
-    """Multiple scattering does not depend on the azimuth: it drops out of differences between rotations."""
+    """Compares differences between two rotations, in which multiple scattering, which is isotropic, cancels."""
     incoming, roughness = toward(np.repeat([0.4, 0.7, 0.9], 20), np.tile(np.arange(20) * 0.31, 3)).astype(np.float64), 0.4
     outgoing = toward(0.7, 0.2).astype(np.float64)
     values, expected = [], []
@@ -115,7 +115,7 @@ def test_the_lobe_is_that_of_gltf(tables, strength):
 
 
 def test_a_smooth_coat_over_black_reflects_by_fresnel(tables):
-    """Beside what the base, a rough dielectric, reflects."""
+    """Albedo of the coat is Fresnel's reflectance; the base, a rough dielectric, is measured without a coat and subtracted."""
     for cosine, fresnel in ((1.0, COAT), (0.5, COAT + (1.0 - COAT) * 0.5**5)):
         bare, coated = (albedo(tables, (BLACK, 0.0, 0.8, (factor, 0.0, 0.0, 0.0)), cosine) for factor in (0.0, 1.0))
         np.testing.assert_allclose(coated - (1.0 - fresnel) * bare, fresnel, rtol=0.05)

@@ -168,7 +168,7 @@ def test_an_emission_texture_is_a_factor(device):
 
 @pytest.mark.parametrize(("mode", "tolerance"), [(FAST, 0.05), (REFERENCE, 0.03)])
 def test_an_emitter_lights_a_floor_by_its_view_factor(device, mode, tolerance):
-    """A square of side 2 a, at the height a above a matt white floor, which reflects its view factor of the emission."""
+    """Radiosity: a diffuse white floor reflects the emission of a parallel square times the view factor. The side is twice the distance."""
     height = 1.5
     above = (0.0, 0.0, height, *UPRIGHT)
     lamps = [replace(surface((0.0, 0.0, 0.0)), emission=emission) for emission in ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0))]

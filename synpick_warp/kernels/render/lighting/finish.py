@@ -93,9 +93,11 @@ def evaluate_layers(tables: AlbedoTables, brdf: FinishedBrdf, view: plain.ViewFa
     if brdf.clearcoat > 0.0:
         albedo = plain.directional_albedo(tables, brdf.coat.roughness, wp.dot(incoming, brdf.coat.normal))
         passing = 1.0 - brdf.clearcoat * plain.coat_albedo(brdf.coat, albedo)
-        reflected = evaluate_brdf(tables, brdf.coat, incoming).specular
+        reflected = wp.vec3(0.0, 0.0, 0.0)
         if radius > 0.0:
             reflected = evaluate_disc(tables, brdf.coat, plain.view_factors(brdf.coat), incoming, radius)
+        else:
+            reflected = evaluate_brdf(tables, brdf.coat, incoming).specular
         result.specular = wp.min(passing, brdf.passing) * result.specular + brdf.clearcoat * reflected
         result.diffuse = passing * brdf.passing / brdf.mean_passing * result.diffuse
     return result

@@ -9,24 +9,24 @@ from typing import Any
 import warp as wp
 
 VARIANTS: dict[str, tuple[Any, ...]] = {}
-"""Structs of parameters annotated `Any`, by name: the plain one and those of variants. Modules that define structs add theirs."""
+"""Structs that a generic kernel parameter (annotated `Any`) accepts, by parameter name, the default first. Modules register theirs."""
 _parameters: dict[wp.Kernel, dict[str, tuple[Any, ...]]] = {}
-"""Parameters of each generic kernel that are annotated `Any`, with their structs."""
+"""Generic parameters of each kernel template, with the structs they accept."""
 _templates: dict[wp.Kernel, wp.Kernel] = {}
-"""Generic kernel of each plain kernel."""
+"""Template of each default kernel."""
 _kernels: dict[tuple[wp.Kernel, frozenset[Any]], wp.Kernel] = {}
-"""Variant of each plain kernel by the structs that are not plain; filled by module."""
+"""Permutations of each default kernel, by the set of structs that are not the default; filled by module."""
 
 
 def variant_of(struct: Any, name: str, **members: Any) -> Any:
-    """Struct with the members of another, but for those named, for kernels that are compiled apart."""
+    """Define a struct type with the members of another, some of which are replaced or added by `members`."""
     body = {"__annotations__": struct.cls.__annotations__ | members, "__module__": struct.cls.__module__, "__doc__": f"As `{struct.key}`."}
     return wp.struct(type(name, (), body))
 
 
 def kernel_of_views(function: Callable[..., None] | None = None, *, name: str = "", drawn: bool = False, **options: Any) -> Any:
-    """Decorate a kernel with parameters of `VARIANTS`, as `wp.kernel` does; the result is the plain kernel. `name`: of a closure. `drawn`:
-    no scene is plain, and the first of the others counts as such."""
+    """Decorate a generic kernel whose parameters annotated `Any` are listed in `VARIANTS`, as `wp.kernel` does; returns its default
+    permutation. `name`: kernel name of a closure. `drawn`: the kernel is never launched with the default scene, whose struct is skipped."""
     if function is None:
         return lambda decorated: kernel_of_views(decorated, name=name, drawn=drawn, **options)
     function.__qualname__ = name or function.__qualname__
@@ -39,7 +39,7 @@ def kernel_of_views(function: Callable[..., None] | None = None, *, name: str = 
 
 
 def kernel_for(kernel: wp.Kernel, *arguments: Any) -> wp.Kernel:
-    """Kernel to launch with these arguments: its variant for the structs among them that are not plain."""
+    """Select the permutation of a kernel for its arguments, by the types of the structs among them."""
     if kernel not in _templates:
         return kernel
     structs = {special for _, *specials in _parameters[_templates[kernel]].values() for special in specials}
