@@ -15,9 +15,9 @@ from synpick_warp.kernels.newton_patches import contact_rows, contact_sweep, sol
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.friction_patches import sort_by_worlds
 
-RESIDENT_WORLDS = 10
-"""Worlds whose iterations a multiprocessor can run at a time: its 65,536 registers hold 10 warps with up to 200 a thread. Where there are
-more worlds, those with the most contact colors start first, or they would run on alone at the end."""
+RESIDENT_WARPS, FEWEST_WARPS = 10, 2
+"""Warps of the iterations that a multiprocessor can run at a time: its 65,536 registers hold 10 with up to 200 a thread; fewest of a world.
+Where there are more worlds, those with the most contact colors start first, or they would run on alone at the end."""
 PATCH_WARP_CONTACTS = 8
 """Number of contacts of two bodies above which a warp grows their friction patches, and not a thread; Newton's is 32. The patches are the
 same, in four fifths of the time (2,048 worlds, H200)."""
@@ -38,19 +38,16 @@ OFFSETS = int(steel.PROPAGATION_COLOR_TAIL) + 2
 
 
 class FusedSteel(newton.solvers.SolverSteel):
-    """SolverSteel whose projected Gauss-Seidel iterations run in one kernel, with one warp per world.
+    """SolverSteel whose projected Gauss-Seidel iterations run in one kernel, with one block per world.
 
     SolverSteel launches ten kernels per iteration: with 16 iterations, 160 of the 364 launches of a substep. Each waits for the one before
     it, for microseconds on an idle GPU, and longer beside a renderer. `solver_iterations` calls the same device functions one after the
-    other, but for the sweep over contacts, which loads 32 at a time (`contact_sweep`) and solves their friction rows by Newton's method
-    (`friction`). With the solver's own search for friction, results are bitwise identical. The warm start of the contacts has more threads.
+    other, but for the sweep over contacts, which keeps them in registers (`contact_sweep`) and solves their friction rows by Newton's
+    method (`friction`). With the solver's own search for friction, results are bitwise identical. The warm start has more threads.
 
     Supported are models of identical worlds, each with one articulation besides its free bodies, and the options that
     `physics.make_solver` sets. Others, such as piles without a gripper, run SolverSteel's own kernels.
     """
-
-    skips_idle = False
-    """Whether worlds without constraint rows have one iteration, to be set before the first step."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         """Prepare a solver for a model; arguments as in SolverSteel."""
@@ -150,8 +147,9 @@ class FusedSteel(newton.solvers.SolverSteel):
 
     @cached_property
     def _sweep_warps(self) -> int:
-        """Warps that sweep the contacts of a world."""
-        return 1 if keeps_rows_shared(self) else contact_sweep.WARPS_OF_MANY
+        """Warps that sweep the contacts of a world: four, or fewer if four of all worlds do not run at a time."""
+        most = RESIDENT_WARPS * self.model.device.sm_count // self._world_count
+        return min(max(most, FEWEST_WARPS), contact_sweep.WARPS_OF_MANY) if keeps_rows_shared(self) else contact_sweep.WARPS_OF_MANY
 
     @cached_property
     def _is_fusable(self) -> bool:
@@ -162,20 +160,19 @@ class FusedSteel(newton.solvers.SolverSteel):
         """Kernel of the iterations, made of the device functions of the solver's own kernels."""
         size = self._propagation_tree_sizes[0]
         rows, bodies = self._propagation_max_constraints, self._max_propagation_bodies
-        sweep_contacts = compose_contacts(rows, bodies, stages_rows=self._sweep_warps == 1)
+        sweep_contacts = compose_contacts(rows, bodies, keeps_rows_shared(self), self._sweep_warps)
         return compose_kernel(
             self._pgs_solve_mf_gs_kernel_for_phase(),
             self._propagation_refresh_kernels[size],
             sweep_contacts,
             self._propagation_propagate_kernels[size],
             self._sweep_warps,
-            self.skips_idle,
         )
 
     def _order_worlds(self) -> wp.array:
         """Order in which the worlds' iterations start (rank) int32; sorted only if not all are resident at a time."""
         order, bins, places, sizes = self._schedule
-        if self._world_count > RESIDENT_WORLDS // self._sweep_warps * self.model.device.sm_count:
+        if self._world_count > RESIDENT_WARPS // self._sweep_warps * self.model.device.sm_count:
             options: dict[str, Any] = {"dim": self._world_count, "device": self.model.device}
             sizes.zero_()
             inputs = [self._color_world_offsets, OFFSETS]
@@ -336,24 +333,23 @@ def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
 
 @cache
 def compose_kernel(
-    rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, propagation: wp.Kernel, warps: int = 1, skips_idle: bool = False
+    rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, propagation: wp.Kernel, warps: int = contact_sweep.WARPS_OF_MANY
 ) -> wp.Kernel:
     """Kernel of the iterations from the sweep over contacts by `warps` a block, and kernels of the solver, each of which calls one device
-    function; `skips_idle`: worlds without rows have one iteration."""
+    function."""
     return solver_iterations.compose_iterations(
         solver_iterations.bind_row_sweep(device_function(rows)),
         solver_iterations.bind_tree_refresh(device_function(refresh)),
         contacts,
         solver_iterations.bind_propagation(device_function(propagation)),
         warps,
-        solver_iterations.count_needed if skips_idle else solver_iterations.count_all,
     )
 
 
 @cache
-def compose_contacts(rows: int, bodies: int, stages_rows: bool = True) -> wp.Function:
-    """Sweep over the contacts of a world with at most `rows` rows and `bodies` bodies; `stages_rows`: as of `compose_contact_sweep`."""
-    return contact_sweep.compose_contact_sweep(rows, bodies, OFFSETS, stages_rows=stages_rows)
+def compose_contacts(rows: int, bodies: int, stages_rows: bool = True, warps: int = contact_sweep.WARPS_OF_MANY) -> wp.Function:
+    """Sweep over the contacts of a world with at most `rows` rows and `bodies` bodies; others as of `compose_contact_sweep`."""
+    return contact_sweep.compose_contact_sweep(rows, bodies, OFFSETS, stages_rows=stages_rows, warps=warps)
 
 
 def device_function(kernel: wp.Kernel) -> wp.Function:

@@ -95,7 +95,7 @@ def test_the_kernel_of_the_iterations_compiles(tmp_path, rows, bodies, stages_ro
     refresh = steel._get_refresh_propagation_tree_body_qd_warp_kernel(4, 2, ARCHITECTURE)
     contacts = fused_solver.compose_contacts(rows, bodies, stages_rows)
     propagate = steel._get_propagate_tree_impulses_revolute_kernel(4, 2, ARCHITECTURE, has_free_root=True)
-    kernel = fused_solver.compose_kernel(joint_rows, refresh, contacts, propagate, 1 if stages_rows else contact_sweep.WARPS_OF_MANY)
+    kernel = fused_solver.compose_kernel(joint_rows, refresh, contacts, propagate)
     wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=False)
     (program,) = tmp_path.glob("*.cubin")
     assert b"solver_iterations_kernel" in program.read_bytes()
@@ -212,20 +212,21 @@ def test_worlds_with_the_most_colors_come_first(device):
 
 
 @pytest.mark.parametrize(
-    ("worlds", "resident", "max_speed", "shared"),
-    [(8, 8, 0.3, True), (8, 8, 4.0, True), (24, 8, 4.0, True), (24, 0, 4.0, True), (8, 8, 4.0, False)],
+    ("worlds", "resident", "max_speed", "shared", "warps"),
+    [(8, 8, 0.3, True, 4), (8, 8, 4.0, True, 1), (24, 8, 4.0, True, 4), (24, 0, 4.0, True, 2), (8, 8, 4.0, False, 4)],
 )
-def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, resident, max_speed, shared):
+def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, resident, max_speed, shared, warps):
     """All but the friction rows is bitwise the same, so the solver's are compiled in. Piles fall, rest and are stirred; at the lower speed
-    limit, falling bodies have velocity limit rows. Newton does not load 32 contacts at a time, takes worlds in their order (they are sorted
-    if none is resident), its narrow phase uses larger blocks, and each of its friction patches is grown by one thread here. Worlds of many
-    objects have impulses and patch lists in global memory, and several warps."""
+    limit, falling bodies have velocity limit rows. Newton does not keep contacts in registers (those of one or two warps are fewer than
+    piles have), takes worlds in their order (they are sorted if none is resident), its narrow phase uses larger blocks, and each of its
+    friction patches is grown by one thread here. Worlds of many objects have impulses and patch lists in global memory."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(
         bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__max_speed=max_speed, physics__deterministic=True
     )
-    monkeypatch.setattr(fused_solver, "RESIDENT_WORLDS", resident)
+    monkeypatch.setattr(fused_solver, "RESIDENT_WARPS", resident)
+    monkeypatch.setattr(fused_solver.FusedSteel, "_sweep_warps", warps)
     if not shared:
         monkeypatch.setattr(fused_solver, "keeps_rows_shared", lambda _: False)
     compose = cache(partial(contact_sweep.compose_contact_sweep, offsets=fused_solver.OFFSETS, friction=NEWTONS_FRICTION))

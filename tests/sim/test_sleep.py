@@ -11,7 +11,7 @@ from synpick_warp.kernels.state import Contacts
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim import sleep
 from synpick_warp.stages.sim.simulate import Simulation
-from tests.harness.world_states import Rows, check_arrays, check_branches, differing
+from tests.harness.world_states import Rows, check_arrays, check_branches
 from tests.worlds.kernel_worlds import filled
 from tests.worlds.small_worlds import CALM, brief, report
 
@@ -197,21 +197,6 @@ def test_arrays_outside_the_state_have_no_influence(device):
         simulation.tick()
     assert list(check_arrays(simulation, 12, {})) == []
     assert asleep(simulation).any()
-
-
-def test_worlds_without_rows_need_one_iteration(device):
-    """On a GPU: the result equals that of a solver that runs all iterations in worlds without constraint rows."""
-    if not device.is_cuda:
-        pytest.skip("a CPU runs the solver's own kernels")
-    one, all_of_them = (brief(device, 3, **SLEEP) for _ in range(2))
-    assert one.physics.solver.skips_idle
-    all_of_them.physics.solver.skips_idle = False
-    for _ in range(40):
-        one.tick()
-        all_of_them.tick()
-    worlds = range(one.layout.worlds)
-    found, expected = (simulation.states.to_host(simulation.get_state(worlds)) for simulation in (one, all_of_them))
-    assert [name for world in worlds for name in differing(expected, found, world)] == []
 
 
 # ---- kernels ----

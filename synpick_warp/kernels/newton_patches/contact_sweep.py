@@ -1,9 +1,10 @@
-"""Colored Gauss-Seidel sweep over the contacts of a world by one warp, which loads 32 contacts at a time into registers.
+"""Colored Gauss-Seidel sweep over the contacts of a world by the warps of a block, each of which keeps 32 contacts in registers.
 
 Newton's SolverSteel loads the contacts of one color, solves them, and goes on with the next color. Piles have many colors of few contacts:
 an object of many convex pieces lies on the tote with 20 contacts, each of a color of its own, and each color waits for memory. Here each
-lane loads one of 32 contacts, consecutive in the order of colors, and the colors among them are solved one after the other. Meanwhile the
-next 32 are prefetched. The arithmetic is the solver's, bit by bit, but for the friction rows (`friction`).
+thread loads one contact, in the order of colors, and the warps take turns to solve the colors among theirs one after the other. Where no
+contact touches the gripper, contacts and twists stay in registers and shared memory for all iterations. Contacts beyond the threads of a
+block are prefetched, and loaded in each iteration. The arithmetic is the solver's, bit by bit, but for the friction rows (`friction`).
 """
 
 import warp as wp
@@ -32,8 +33,8 @@ MAX_SHARED_ROWS = 3072
 """Maximum number of rows of a world whose impulses and lists of patch members lie in shared memory: they take 24 of the 48 KB of a block.
 Those of more rows lie in global memory, and are prefetched to the L1 cache."""
 WARPS_OF_MANY = 4
-"""Warps of a block, which sweeps a world, where rows lie in global memory: as many times 32 contacts are loaded at a time, and those of one
-color solved at once. Of 3,600 contacts, a color has 50. Two such blocks fit into the registers of a multiprocessor."""
+"""Warps of a block, which sweeps a world, where rows lie in global memory: contacts of one color in all of them are solved at once. Of
+3,600 contacts, a color has 50. Two such blocks fit into the registers of a multiprocessor."""
 SECTOR = 8
 """Words that a prefetch brings to the L1 cache at least: 32 bytes."""
 TWIST_STRIDE = 8
@@ -46,9 +47,10 @@ def shared_bytes(rows: int, bodies: int, stages_rows: bool = True) -> int:
     return 4 * words + bodies + 1
 
 
-def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = SOLVE_FRICTION, stages_rows: bool = True) -> wp.Function:
-    """Create the sweep over the contacts of a world, for a GPU: all iterations of a solve in one launch, with a block for each world: one
-    warp, or `WARPS_OF_MANY` unless rows are in shared memory, which changes no result.
+def compose_contact_sweep(
+    rows: int, bodies: int, offsets: int, friction: str = SOLVE_FRICTION, stages_rows: bool = True, warps: int = WARPS_OF_MANY
+) -> wp.Function:
+    """Create the sweep over the contacts of a world, for a GPU: all iterations of a solve in one launch, with a block for each world.
 
     Impulses, patch lists and starts of colors stay in shared memory from the first iteration to the last, which writes the impulses. Two
     contacts that share a body, or a patch, must have different colors. A contact of another kind than `WITH_FRICTION` and `NORMAL_ONLY` is
@@ -60,6 +62,7 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
             contacts.
         friction: Source of the function `solve_friction`.
         stages_rows: Whether impulses and patch lists lie in shared memory; the arithmetic is the same.
+        warps: Warps of a block, which change no result.
 
     Raises:
         ValueError: `rows` exceeds `MAX_SHARED_ROWS`, and they are to lie in shared memory.
@@ -67,16 +70,21 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
     if stages_rows and rows > MAX_SHARED_ROWS:
         raise ValueError(f"{rows:,} contact rows of a world do not fit into shared memory; at most {MAX_SHARED_ROWS:,} do.")
 
-    @wp.func_native(_source(rows, bodies, offsets, friction, 1 if stages_rows else WARPS_OF_MANY))
+    @wp.func_native(_source(rows, bodies, offsets, friction, stages_rows, warps))
     def sweep_contacts(
         world: int,
         iteration: int,
+        is_alone: bool,
         settings: IterationSettings,
         contacts: ContactRowData,
         twist_inout: wp.array2d[float],
         impulse_inout: wp.array2d[float],
-    ):
-        """Gauss-Seidel sweep over the contacts of a world: updates the impulses of rows and bodies, and the twists, by one block."""
+    ) -> int:
+        """Gauss-Seidel sweep over the contacts of a world: updates the impulses of rows and bodies, and the twists, by one block.
+
+        Returns the number of iterations: all that are left if nothing but contacts changes velocities between them, one otherwise.
+        `is_alone`: the world has no other rows.
+        """
         ...
 
     return sweep_contacts
@@ -87,11 +95,10 @@ _SHARED = (
     __shared__ int patch_list[{rows}];""",
     """
         const int listed = min(contacts.patch_list_length.data[world], {rows});
-        for (int i = lane; i < row_count; i += 32) impulses[i] = contacts.impulse.data[first_row + i];
-        for (int i = lane; i < listed; i += 32) patch_list[i] = contacts.patch_lists.data[first_row + i];""",
+        for (int i = lane; i < row_count; i += THREADS) impulses[i] = contacts.impulse.data[first_row + i];
+        for (int i = lane; i < listed; i += THREADS) patch_list[i] = contacts.patch_lists.data[first_row + i];""",
     """
-    if (ends)
-        for (int i = lane; i < row_count; i += 32) contacts.impulse.data[first_row + i] = impulses[i];""",
+        for (int i = lane; i < row_count; i += THREADS) contacts.impulse.data[first_row + i] = impulses[i];""",
     "",
 )
 """CUDA source of impulses and patch lists in shared memory: declarations, statements before the first and after the last iteration, and
@@ -107,16 +114,16 @@ _GLOBAL = (
 """As `_SHARED`, in global memory."""
 
 
-def _source(rows: int, bodies: int, offsets: int, friction: str, warps: int) -> str:
+def _source(rows: int, bodies: int, offsets: int, friction: str, stages_rows: bool, warps: int) -> str:
     """CUDA source of the sweep by `warps` warps a block. A static body's twist is that of a slot behind the others, zero."""
-    declare, begin, end, prefetch = (part.replace("{rows}", str(rows)) for part in (_SHARED if warps == 1 else _GLOBAL))
-    find, visit = (_FIND_COLORS, _VISIT_COLORS) if warps == 1 else (_FIND_COLORS_OF_MANY, _VISIT_COLORS_OF_MANY)
+    declare, begin, end, prefetch = (part.replace("{rows}", str(rows)) for part in (_SHARED if stages_rows else _GLOBAL))
     source = f"""
 #if defined(__CUDA_ARCH__)
 {friction}
     const auto prefetch = [](const void* address) {{ asm volatile("prefetch.global.L1 [%0];" :: "l"(address)); }};
-    const int lane = threadIdx.x & LAST;
-    if (contacts.row_count.data[world] == 0) return;
+    const int lane = threadIdx.x;
+    const int end_iteration = settings.iteration_offset + settings.iterations;
+    if (contacts.row_count.data[world] == 0) return is_alone ? end_iteration - iteration : 1;
     const int first_row = world * {rows};
     const int* color_offsets = &contacts.color_offsets.data[world * {offsets}];
     const int uncolored = color_offsets[{offsets} - 2], count = color_offsets[{offsets} - 1];
@@ -126,38 +133,47 @@ def _source(rows: int, bodies: int, offsets: int, friction: str, warps: int) -> 
     __shared__ bool is_free[{bodies} + 1];
 {declare}
     __shared__ unsigned color_starts[({rows} + 31) / 32];
-    const bool begins = iteration == settings.iteration_offset, ends = iteration + 1 == settings.iteration_offset + settings.iterations;
     const int row_count = min(contacts.row_count.data[world], {rows}), slots = contacts.body_count.data[world];
-    if (begins) {{{begin}
-{find.replace("OFFSETS", str(offsets))}
+    if (iteration == settings.iteration_offset) {{{begin}
+{_FIND_COLORS.replace("OFFSETS", str(offsets))}
     }}
 {_LOAD_BODIES}
-    SYNCHRONIZE
+    const bool is_last = !__syncthreads_or(touches) && is_alone;
+    const int stop = is_last ? end_iteration : iteration + 1;
+{_DECLARE}
+    for (int now = iteration; now < stop; ++now)
     for (int first = 0; first < count; first += THREADS) {{
         const int index = first + lane;
+        if (now == iteration || count > THREADS) {{
 {_LOAD.replace("PREFETCH", prefetch)}
-{visit}
+        }}
+{_VISIT_IN_TURN if stages_rows else _VISIT_AT_ONCE}
     }}
-{_STORE_BODIES}{end}
+{_STORE_BODIES}
+    if (stop == end_iteration) {{{end}
+    }}
+    return stop - iteration;
+#else
+    return 1;
 #endif
 """
-    synchronize = "__syncwarp();" if warps == 1 else "__syncthreads();"
-    values = {"BODIES": bodies, "WARPS": warps, "THREADS": 32 * warps, "LAST": 32 * warps - 1, "SYNCHRONIZE": synchronize}
-    for name, value in values.items():
+    for name, value in {"BODIES": bodies, "WARPS": warps, "THREADS": 32 * warps}.items():
         source = source.replace(name, str(value))
     return source
 
 
 _LOAD_BODIES = f"""
+    bool touches = false;
     for (int i = lane; i < slots * 6; i += THREADS) {{
         const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * BODIES + slot];
         twists[slot * {TWIST_STRIDE} + component] = twist_inout.data[body * 6 + component];
         body_impulses[i] = impulse_inout.data[body * 6 + component];
         is_free[slot] = contacts.is_free.data[body];
+        touches |= !is_free[slot];
     }}
     if (lane < {TWIST_STRIDE}) twists[BODIES * {TWIST_STRIDE} + lane] = 0.0f;
     is_free[BODIES] = true;"""
-"""Load the twists of a world's bodies, the impulses on them, and which ones are free."""
+"""Load the twists of a world's bodies, the impulses on them, and which ones are free; `touches`: one of them is not."""
 
 _STORE_BODIES = f"""
     for (int i = lane; i < slots * 6; i += THREADS) {{
@@ -167,9 +183,14 @@ _STORE_BODIES = f"""
     }}"""
 """Store the twists of a world's bodies and the impulses on them."""
 
+_DECLARE = f"""
+    int record[{RECORD}], row0 = 0;
+    float mass = 0.0f, mu = 0.0f, Ja[3][6] = {{0}}, Jb[3][6] = {{0}}, Ma[3][6], Mb[3][6], rhs[3], friction_operator[{FRICTION_OPERATOR}];"""
+"""Registers of the thread's contact."""
+
 _LOAD = f"""
         // The next iteration begins with the first contacts again. The record of a contact is prefetched before its rows, which it tells.
-        const int padded = (count + LAST) / THREADS * THREADS;
+        const int padded = (count + THREADS - 1) / THREADS * THREADS;
         const int next = index + THREADS < padded ? index + THREADS : lane;
         const int after = next + THREADS < padded ? next + THREADS : lane;
         if (after < count) {{
@@ -189,8 +210,10 @@ _LOAD = f"""
                 prefetch(&contacts.friction_operator.data[(first_row + next) * {FRICTION_OPERATOR} + 4]);
             }}
         }}
-        int record[{RECORD}] = {{0}};
-        if (index < count) {{
+        if (index >= count) {{
+            #pragma unroll
+            for (int k = 0; k < {RECORD}; ++k) record[k] = 0;
+        }} else {{
             const int4* words = reinterpret_cast<const int4*>(&contacts.records.data[(first_row + index) * {RECORD}]);
             #pragma unroll
             for (int k = 0; k < {RECORD // 4}; ++k) {{
@@ -199,8 +222,7 @@ _LOAD = f"""
             }}
             if (record[{KIND}] == 0) contacts.overflow.data[world] = true;
         }}
-        const int row0 = record[0];
-        float mass, mu, Ja[3][6] = {{0}}, Jb[3][6] = {{0}}, Ma[3][6], Mb[3][6], rhs[3], friction_operator[{FRICTION_OPERATOR}];
+        row0 = record[0];
         #pragma unroll
         for (int r = 0; r < 3; ++r) {{
             if ({HAS_FRICTION} || (r == 0 && record[{KIND}] == {NORMAL_ONLY})) {{
@@ -225,9 +247,10 @@ _LOAD = f"""
             for (int k = 0; k < {FRICTION_OPERATOR}; ++k)
                 friction_operator[k] = __ldg(&contacts.friction_operator.data[(first_row + index) * {FRICTION_OPERATOR} + k]);
         }}"""
-"""Load the lane's contact; prefetch the one 32 places further, and the record of the one 64 places further."""
+"""Load the thread's contact; prefetch the one of the next block of them, and the record of the one after it."""
 
 _FIND_COLORS = """
+        if (lane < 32)
         for (int first = 0, color = 0; first < count; first += 32) {
             const int index = first + lane;
             unsigned starts = index >= uncolored && index < count ? 1u << lane : 0u;
@@ -239,9 +262,10 @@ _FIND_COLORS = """
                 color += __popc(inside);
             }
             for (int distance = 16; distance > 0; distance /= 2) starts |= __shfl_xor_sync(~0u, starts, distance);
-            if (lane == 0) color_starts[first / 32] = starts & ~1u;
+            if (lane == 0) color_starts[first / 32] = starts;
         }"""
-"""Find where colors start among each 32 contacts, as bits; `color` is the first color that does not start before them."""
+"""Find where colors start among each 32 contacts, as bits, by the first warp; `color` is the first color that does not start before
+them."""
 
 
 def _dot(row: int) -> str:
@@ -304,7 +328,7 @@ _SOLVE = f"""
 {_respond(0, "change0")}
                 }}
                 if ({HAS_FRICTION}) {{
-                  if (iteration < settings.friction_start_iteration) {{
+                  if (now < settings.friction_start_iteration) {{
                     impulse[1] = 0.0f;
                     impulse[2] = 0.0f;
                   }} else {{
@@ -348,32 +372,36 @@ _SOLVE = f"""
                         sum = fmaf(Jb[1][k], change1, fmaf(Jb[2][k], change2, fmaf(Jb[0][k], change0, sum)));
                     }}
                 }}"""
-"""Solve the lane's contact: its normal row, then its two friction rows together, whose responses are added in the order of the solver."""
+"""Solve the thread's contact: its normal row, then its two friction rows together, whose responses are added in the order of the solver."""
 
-_VISIT_COLORS = f"""        unsigned starts = color_starts[first / 32];
-        for (int begin = 0; begin < 32;) {{
-            const int end = starts ? __ffs(starts) - 1 : 32;
-            if (record[{KIND}] != 0 && begin <= lane && lane < end) {{
+_VISIT_IN_TURN = f"""
+        for (int turn = 0; turn < WARPS && first + 32 * turn < count; ++turn) {{
+            if (lane / 32 == turn) {{
+                unsigned starts = color_starts[first / 32 + turn] & ~1u;
+                for (int begin = 32 * turn; begin < 32 * turn + 32;) {{
+                    const int end = 32 * turn + (starts ? __ffs(starts) - 1 : 32);
+                    if (record[{KIND}] != 0 && begin <= lane && lane < end) {{
 {_SOLVE}
+                    }}
+                    __syncwarp();
+                    starts &= starts - 1;
+                    begin = end;
+                }}
             }}
-            SYNCHRONIZE
-            starts &= starts - 1;
-            begin = end;
+            __syncthreads();
         }}"""
-"""Solve the colors among the contacts of a warp one after the other."""
+"""Solve the colors among the contacts of one warp after the other."""
 
-_FIND_COLORS_OF_MANY = f"        if (lane < 32) {{{_FIND_COLORS.replace('starts & ~1u', 'starts')}\n        }}"
-"""As `_FIND_COLORS`, by the first of several warps; a bit also tells whether a color starts at the first of 32 contacts."""
-
-_VISIT_COLORS_OF_MANY = f"""        unsigned starts = color_starts[first / 32] & ~1u;
+_VISIT_AT_ONCE = f"""
+        unsigned starts = color_starts[first / 32] & ~1u;
         for (int begin = 0, word = 0; begin < THREADS;) {{
             while (starts == 0 && ++word < WARPS && first + 32 * word < count) starts = color_starts[first / 32 + word];
             const int end = starts ? 32 * word + __ffs(starts) - 1 : THREADS;
             if (record[{KIND}] != 0 && begin <= lane && lane < end) {{
 {_SOLVE}
             }}
-            SYNCHRONIZE
+            __syncthreads();
             starts &= starts - 1;
             begin = end;
         }}"""
-"""As `_VISIT_COLORS`, for the contacts of several warps."""
+"""Solve the colors among the contacts of all warps one after the other, which may reach from one warp to the next."""

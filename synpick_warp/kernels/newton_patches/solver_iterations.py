@@ -246,23 +246,10 @@ def bind_propagation(function: wp.Function) -> wp.Function:
     return propagate
 
 
-@wp.func
-def count_all(iterations: int, rows: int, has_others: bool) -> int:
-    """Number of iterations of every world."""
-    return iterations
-
-
-@wp.func
-def count_needed(iterations: int, rows: int, has_others: bool) -> int:
-    """Number of iterations of a world: one, with the same result, where it has neither contact rows nor others. Worth it where many do."""
-    return wp.where(rows > 0 or has_others, iterations, wp.min(iterations, 1))
-
-
 def compose_iterations(
-    sweep_rows: wp.Function, refresh_tree: wp.Function, sweep_contacts: wp.Function, propagate: wp.Function, warps: int, count: wp.Function
+    sweep_rows: wp.Function, refresh_tree: wp.Function, sweep_contacts: wp.Function, propagate: wp.Function, warps: int
 ) -> wp.Kernel:
-    """Create the kernel of the iterations from the device functions of the solver, wrapped by those above, for blocks of `warps`; `count`
-    is `count_all` or `count_needed`."""
+    """Create the kernel of the iterations from the device functions of the solver, wrapped by those above, for blocks of `warps`."""
     leads, synchronize = (is_any, synchronize_warp) if warps == 1 else (is_of_first_warp, synchronize_block)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -285,7 +272,8 @@ def compose_iterations(
         An iteration sweeps joint limits, contacts in generalized coordinates, colored contacts, the response of the gripper to these, and
         speed limits; sweeps without rows are skipped. Velocities of free bodies exist twice: in `v`, generalized velocities, and as twists.
         They are copied between the two in every iteration if a sweep over `v` can change them, otherwise before the first and after the
-        last one. `impulse_inout` ends as 0. Launched over rank, thread of a block: one block per world, worlds in `order`.
+        last one. Where no contact touches the gripper either, contacts have all iterations at once: the gripper's velocities would stay
+        as they are. `impulse_inout` ends as 0. Launched over rank, thread of a block: one block per world, worlds in `order`.
         """
         rank, lane = wp.tid()
         world = order[rank]
@@ -293,9 +281,9 @@ def compose_iterations(
         free_contacts = rows.mf_contact_rows_end[world]
         has_contacts = bodies.dense_contact_world_flag[world] != 0 or free_contacts > 0
         has_velocity_limits = settings.velocity_limits != 0 and rows.mf_constraint_count[world] > free_contacts
-        iterations = count(settings.iterations, contacts.row_count[world], has_limits or has_contacts or has_velocity_limits)
-        last = iterations - 1
-        for step in range(iterations):
+        is_alone = not (has_limits or has_contacts or has_velocity_limits)
+        step = int(0)
+        while step < settings.iterations:
             iteration = settings.iteration_offset + step
             if leads(lane):
                 if has_limits:
@@ -306,11 +294,11 @@ def compose_iterations(
                 if step == 0 or has_contacts or has_velocity_limits:
                     load_free_twists(world, lane, bodies, v_inout, twist_inout)
             synchronize()
-            sweep_contacts(world, iteration, settings, contacts, twist_inout, impulse_inout)
+            step += sweep_contacts(world, iteration, is_alone, settings, contacts, twist_inout, impulse_inout)
             synchronize()
             if leads(lane):
                 propagate(world, bodies, impulse_inout, twist_inout, v_inout)
-                if step == last or has_contacts or has_velocity_limits:
+                if step == settings.iterations or has_contacts or has_velocity_limits:
                     store_free_twists(world, lane, bodies, twist_inout, impulse_inout, v_inout)
                 synchronize_warp()
                 if has_velocity_limits:

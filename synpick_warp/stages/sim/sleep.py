@@ -11,7 +11,6 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.kernels.sim import sleep
 from synpick_warp.kernels.state import Motion
 from synpick_warp.newton_patches.broad_phase import SeparatingBroadPhase
-from synpick_warp.newton_patches.solver import FusedSteel
 from synpick_warp.stages.arrays import allocate, allocate_struct, array_group, bundle, struct_arrays
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
@@ -44,8 +43,6 @@ class Sleep:
         self._pair_count = wp.zeros(1, dtype=wp.int32, device=device)
         pipeline.broad_phase.choose = self.choose
         physics.sleepers = self
-        if isinstance(physics.solver, FusedSteel):
-            physics.solver.skips_idle = True
 
     def choose(self, overlaps: wp.array, count: wp.array) -> tuple[wp.array, wp.array]:
         """Broad-phase filter: of pairs of shapes (overlap) vec2i and their number (one) int32, those with a shape of an awake body."""
