@@ -1,5 +1,5 @@
-"""Narrow phase of collision detection: launch sizes on a GPU, early compilation of its kernels, which take longest to compile, and contact
-matching between substeps in which no contact loses its impulse to another one, in place of Newton's."""
+"""Narrow phase of collision detection: launch sizes and order of contacts on a GPU, early compilation of its kernels, which take longest to
+compile, and contact matching between substeps in which no contact loses its impulse to another one, in place of Newton's."""
 
 import contextlib
 import threading
@@ -18,7 +18,7 @@ from newton._src.sim import model as newton_model
 from newton._src.solvers.steel import solver_steel  # noqa: F401  (Newton imports it late, and its modules are split below.)
 from warp._src import context
 
-from synpick_warp.kernels.newton_patches import contact_matching
+from synpick_warp.kernels.newton_patches import contact_matching, key_ranks
 from synpick_warp.system.hardware.kernels import ModuleBuild, build_of, split_modules
 
 # Of the kernels in these modules of Newton, a bake launches a fifth.
@@ -37,6 +37,10 @@ takes, and a block holds the registers of all its threads until the last one is 
 world has some 60 pairs, about as many as its two blocks have threads."""
 SMALL_BLOCK = 64
 """Threads a block of `small_blocks`."""
+RANKED = 1 << 15
+"""Contacts, at most, whose keys are sorted by their ranks, in a time that grows with the square of their number: those of 64 worlds."""
+LANES = 32
+"""Threads of a warp."""
 REFINE_BLOCK = 32
 """Block size of the narrow phase's refinement in Newton; its kernel takes longer to compile than any other."""
 _BUILDERS = {
@@ -84,6 +88,29 @@ def _resolve_block(device: wp.Device, block: int | None) -> int:
 
 _thread, _resolve_launch_block_dim = threading.local(), context._resolve_launch_block_dim
 context._resolve_launch_block_dim = _resolve_block
+
+
+def rank_contacts(pipeline: newton.CollisionPipeline) -> None:
+    """Have a pipeline sort its contacts by their ranks on a GPU, if they are few; the order is the same."""
+    sorter = pipeline._contact_sorter
+    if sorter is not None and pipeline.model.device.is_cuda and sorter._capacity <= RANKED:
+        sorter._sort_keys_copy.is_ranked = True
+
+
+def sort_pairs(keys: wp.array, values: wp.array, count: int, begin_bit: int = 0, end_bit: int | None = None) -> None:
+    """Sort keys with their values; arguments as of Warp's `radix_sort_pairs`, in whose place it stands. Values of ranked keys are those of
+    Newton's contact sorter, 0, 1, 2, ..."""
+    if not getattr(keys, "is_ranked", False):
+        _radix_sort_pairs(keys, values, count, begin_bit, end_bit)
+        return
+    lanes = LANES if keys.device.is_cuda else 1
+    given: dict[str, Any] = {"outputs": [keys, values], "device": keys.device}
+    wp.launch(key_ranks.rank_keys_kernel, dim=(count, lanes), inputs=[count, lanes], **given)
+    wp.launch(key_ranks.take_sorted_kernel, dim=count, inputs=[count], **given)
+
+
+_radix_sort_pairs = wp.utils.radix_sort_pairs
+wp.utils.radix_sort_pairs = sort_pairs
 
 
 def slow_builds(device: wp.Device) -> list[ModuleBuild]:

@@ -12,7 +12,7 @@ from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.kernels.newton_patches import contact_matching as kernels
 from synpick_warp.kernels.newton_patches.friction import solve_friction
 from synpick_warp.kernels.newton_patches.friction_patches import sort_contacts_kernel
-from synpick_warp.newton_patches.narrow_phase import MAX_DISTANCE
+from synpick_warp.newton_patches.narrow_phase import MAX_DISTANCE, sort_pairs
 from synpick_warp.scenes.collision.hulls import hull_planes
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece
@@ -53,6 +53,22 @@ def complete(device, contacts: list[tuple[int, float, tuple]], match: list[int])
     inputs.append(vectors([normal for _, _, normal in contacts]))
     wp.launch(kernels.complete_matching_kernel, dim=len(contacts) + 2, inputs=inputs, outputs=[matches], device=device)
     return matches.numpy().tolist()
+
+
+@pytest.mark.parametrize(("count", "bits"), [(0, 1), (1, 1), (33, 3), (700, 40), (1000, 4)])
+def test_contacts_sorted_by_ranks_are_in_the_order_of_a_stable_sort(device, count, bits):
+    """Random keys, some equal, in front of unused slots, as NumPy and Warp's radix sort order them."""
+    capacity = 1000
+    random = np.full(2 * capacity, int(UNUSED))
+    random[:count] = np.random.default_rng(count).integers(0, 1 << bits, count)
+    order = np.argsort(random[:count], kind="stable")
+    for is_ranked in (True, False):
+        keys = wp.array(random, dtype=wp.int64, device=device)
+        indices = wp.array(np.r_[:capacity, :capacity], dtype=int, device=device)
+        keys.is_ranked = is_ranked
+        sort_pairs(keys, indices, capacity, end_bit=63)
+        np.testing.assert_array_equal(keys.numpy()[:capacity], np.sort(random[:capacity]))
+        np.testing.assert_array_equal(indices.numpy()[:count], order)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from synpick_warp.kernels.sim import arrangement, gripper, rest
 from synpick_warp.kernels.state import Contacts
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase
-from synpick_warp.newton_patches.narrow_phase import complete_matching, resize_blocks, small_blocks
+from synpick_warp.newton_patches.narrow_phase import complete_matching, rank_contacts, resize_blocks, small_blocks
 from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
 from synpick_warp.stages.arrays import bundle
@@ -296,6 +296,7 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
     if physics.match_all:
         complete_matching(pipeline)
     replace_broad_phase(pipeline)
+    rank_contacts(pipeline)
     resize_blocks(pipeline)
     return pipeline
 
