@@ -34,6 +34,7 @@ RELATED = {
     "gripper": "mesh cup_width kind valve",
     "randomize": "background_textures",
     "bop": "split color_format depth_scale",
+    "still": "target_spread",
     "depth_sensor": "baseline disparity_step max_disparity preset",
     "move": "height start_height",
     "pick": "press_time near appear_height speed near_speed lift_height",
