@@ -424,6 +424,7 @@ SEARCHED = r"a maximum of at most 2.5\d, from which on 256 disparities are searc
         ({"render.layers": ["ir_right"], "depth_sensor.distances": [5, 9]}, "depth_sensor.distances", REACHES),
         ({"render.layers": ["depth_stereo"], "depth_sensor.baseline": 0.3}, "depth_sensor.distances", SEARCHED),
         ({"depth_sensor.grazing_angle": 1}, "depth_sensor.grazing_angle", "at least 10, at most 89"),
+        ({"depth_sensor.multipath": 1.5}, "depth_sensor.multipath", "at least 0, at most 1"),
         ({"render.exposure": 1e9}, "render.exposure", "at least 0.01, at most 100"),
         ({"render.exposure": 1e-9}, "render.exposure", "at least 0.01, at most 100"),
         ({"gripper.cup_length": 1e6}, "gripper.cup_length", r"at least 0.005, at most 0.5 \[m\]"),

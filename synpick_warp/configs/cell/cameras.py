@@ -216,16 +216,13 @@ def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
 class DepthSensor:
     """Depth camera model: structured light for the layer depth_sensor, active stereo for ir_left, ir_right and depth_stereo. Of the
     settings up to registration, stereo uses baseline, disparity_step, max_disparity and distances. Axial noise is sigma_z = noise +
-    noise_growth (z - noise_distance)² + noise_angle / √z · (θ / (π/2 - θ))² (Nguyen, Izadi and Lovell, 3DIMPVT 2012), with z in m and θ the
-    angle of incidence; noise of disparity adds z² disparity_noise / (f · baseline). Not in the paper.
-    """
+    noise_growth (z - noise_distance)² + noise_angle / √z · (θ / (π/2 - θ))² (Nguyen et al., 3DIMPVT 2012), with z in m and θ the angle of
+    incidence."""
 
     preset: str = setting(
         "", "Sensor of [configs/calibration/sensors.toml](calibration/sensors.toml): sets what is not set here.", choices=("", *SENSORS)
     )
-    baseline: Annotated[float, "(0, 1] m"] = setting(
-        0.075, "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012), or to the right camera."
-    )
+    baseline: Annotated[float, "(0, 1] m"] = setting(0.075, "Distance from the camera to the projector at its right, or the right camera.")
     disparity_step: Annotated[float, "(0, 16] px"] = setting(
         0.125, "Disparity quantization: depth steps of z² / (f · baseline) times this (Khoshelham and Elberink, 2012)."
     )
@@ -252,8 +249,13 @@ class DepthSensor:
     shadows: bool = setting(True, "No depth where the projector is occluded, or the infrared camera that registration names.")
     clear_reach: Annotated[float, "[0, 1e3] m"] = setting(
         0.1,
-        "Distance behind a transparent surface at which 1/e of what is there is still measured, the rest being holes (layer "
+        "Distance behind a transparent surface at which 1/e of what is there is still measured, else holes (layer "
         "depth_sensor; fitted to frames of ClearGrasp's D435); 0: as if they were opaque.",
+    )
+    multipath: Fraction = setting(
+        0.0,
+        "Share of light from mirrored second surfaces that is not rejected: metal corners are measured too deep (Freedman et al., 2014), "
+        "with holes where it outweighs direct light (layer depth_sensor).",
     )
     registration: Fraction = setting(
         0.0,

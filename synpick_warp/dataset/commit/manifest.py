@@ -88,8 +88,8 @@ _YOUNGER: dict[str, dict[str, Any]] = {
     "arrangement": {"fill": WITHIN, "counts": (), "drop": COLUMN, "upright": 0.0},
     "settle": {"restless": 0.0},
     "physics": {"match_all": False, "sleep": 0.0},
-    "depth_sensor": {"preset": "", "disparity_noise": 0.0, "max_disparity": 0.0, "noise_width": 1, "registration": 0.0}
-    | {"projector": 0.5, "dot_spacing": 4.0, "dot_brightness": 2.0, "ambient": 0.25, "infrared_noise": 0.005, "clear_reach": 0.0},
+    "depth_sensor": {"preset": "", "disparity_noise": 0.0, "max_disparity": 0.0, "noise_width": 1, "registration": 0.0, "projector": 0.5}
+    | {"dot_spacing": 4.0, "dot_brightness": 2.0, "ambient": 0.25, "infrared_noise": 0.005, "clear_reach": 0.0, "multipath": 0.0},
     "pick": {"forgive": False, "retry": SAME},
     "perception": {"camera": "", "grasp_point": MASK},
     "render": {"table_size": (0.0, 0.0), "shutter_samples": 8},

@@ -13,6 +13,7 @@ from synpick_warp.kernels.render.images import layers
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters
 from synpick_warp.kernels.render.images.clear_bodies import measure_behind_kernel
 from synpick_warp.kernels.render.images.depth_sensor import find_nearest_kernel, render_depth_sensor_kernel
+from synpick_warp.kernels.render.images.multipath import add_multipath_kernel
 from synpick_warp.kernels.render.images.suction_map import render_suction_seal_kernel, render_suction_wrench_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FAR
@@ -80,13 +81,14 @@ def layer_scene(scene: RenderScene) -> Any:
 class LayerRenderer:
     """Renders annotation layers. Owns its scratch; `render` only launches, so a CUDA graph can capture it."""
 
-    def __init__(self, names: tuple[str, ...], sensor: Any, scene: RenderScene, instances: int, views: int) -> None:
+    def __init__(self, names: tuple[str, ...], sensor: Any, scene: RenderScene, instances: int, views: int, multipath: float = 0.0) -> None:
         """Allocate scratch, if a layer needs motions. `names`: layers to render, from `layers.LAYER_TABLE`. `sensor`: the struct
         `SensorParameters`. `scene`: constant data. `instances`: instance capacity of a world. `views`: largest number of views in a batch.
-        Raises CatalogError: `names` has classes, and an obj_id is 0 or does not fit into 16 bits."""
+        `multipath`: of the settings; not in `sensor`, whose kernels have no use for it. Raises CatalogError: `names` has classes, and an
+        obj_id is 0 or does not fit into 16 bits."""
         self.scene = scene
         self.names = names
-        self.sensor = sensor
+        self.sensor, self.multipath = sensor, multipath
         if "classes" in names:
             wrong = [obj_id for obj_id in scene.obj_id.numpy().tolist() if not 0 < obj_id <= MAX_CLASS and obj_id > FIRST_DISTRACTOR]
             if wrong:
@@ -132,6 +134,8 @@ class LayerRenderer:
             dim, inputs = (shot.views.count, scene.grid.tiles), [scene.grid, seen.gbuffer]
             wp.launch(find_nearest_kernel, dim=dim, inputs=inputs, outputs=[layer.nearest], device=scene.device)
             launch_pixels(render_depth_sensor_kernel, pixels, [scene.paths, layer, seen], [measured], scene.device)
+            if self.multipath > 0.0:
+                launch_pixels(add_multipath_kernel, pixels, [scene.paths, layer, seen, self.multipath], [measured], scene.device)
         if further is not None:
             inputs = [scene.paths, layer, shot, behind.gbuffer.depth, further]
             launch_pixels(measure_behind_kernel, pixels, inputs, [image], scene.device)

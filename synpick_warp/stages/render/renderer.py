@@ -88,7 +88,7 @@ class Renderer:
             self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views, kept_row, kept)
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances, kept=kept)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
-        self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, bodies, views)
+        self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, bodies, views, depth_sensor.multipath)
         self.behind: SceneBehind | None = None
         seen = self.layer_renderer.sees_through
         if seen or (scene.is_transparent and self.shading is not None):
