@@ -28,6 +28,7 @@ from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.system.inputs.urls import resolve_word, store_url
 from synpick_warp.system.interpreter import collection_paused
 from synpick_warp.system.processes.interrupt import KeptInterrupt, raising_sigterm
+from synpick_warp.system.processes.isolation import start_server
 
 if TYPE_CHECKING:
     from synpick_warp.factory.episodes import BakeSummary
@@ -414,6 +415,8 @@ def _bake(
     price: float,
 ) -> int:
     """Check device and folders, which is cheap, then bake: in this process and its children, or by the workers of an engine."""
+    if (config.bake.models or config.bake.lights) and not (devices or engine):
+        start_server()
     with collection_paused(freezes=True):
         from synpick_warp.cli.display import make_console, make_progress, print_summary
         from synpick_warp.exporters.writing.files import check_output_folder

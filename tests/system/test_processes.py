@@ -20,7 +20,7 @@ import pytest
 from synpick_warp.errors import CatalogError, DatasetError
 from synpick_warp.system.processes import isolation
 from synpick_warp.system.processes.interrupt import RETRY, SIGNALS, KeptInterrupt, StopRequest
-from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
+from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated, start_server
 from synpick_warp.system.processes.pool import TaskError, WorkerPool, WorkerProgram, map_ordered
 from tests.harness.environment import checkout_environment
 
@@ -248,6 +248,15 @@ def test_a_server_that_has_ended_is_started_again():
     assert isolation._server._worker is not None
     isolation._server._worker.process.kill()
     assert list(run_isolated(math.sqrt, [(4.0,)], LIMITS)) == [2.0]
+
+
+def test_a_server_that_was_started_ahead_takes_the_calls():
+    isolation._server.stop()
+    start_server()
+    worker = isolation._server._worker
+    assert list(run_isolated(math.sqrt, [(4.0,)], LIMITS)) == [2.0]
+    assert worker is not None
+    assert isolation._server._worker is worker
 
 
 def test_calls_that_lose_their_server_share_the_next_one():

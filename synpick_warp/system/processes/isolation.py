@@ -79,23 +79,28 @@ class _Server:
         self._lock = threading.Lock()
         self._worker: WorkerProcess | None = None
 
+    def start(self, failed: WorkerProcess | None = None) -> WorkerProcess:
+        """The running server, started if there is none, or only the one that `failed`; the caller holds the lock. Raises OSError."""
+        if self._worker is None or self._worker is failed or self._worker.process.poll() is not None:
+            self.stop()
+            program = f"from synpick_warp.system.processes.isolation import main; main({MODULES!r}, {IDLE_TIME!r})"
+            self._worker = start_process(program, environment=_ENVIRONMENT, has_threads=True)
+        return self._worker
+
     def open_link(self, result: int, failed: WorkerProcess | None) -> tuple[socket.socket, WorkerProcess]:
         """Ask the server for a process in the current folder that writes its result into the file with handle `result`. `failed`: server of
         this call's first attempt, which exited without an answer; None at the first attempt. It is replaced once, by whichever of its calls
         asks first. Returns the socket connected to the supervisor of the new process, and the server that was asked."""
         ours, theirs = socket.socketpair()
         with theirs, self._lock:
-            if self._worker is None or self._worker is failed or self._worker.process.poll() is not None:
-                self.stop()
-                program = f"from synpick_warp.system.processes.isolation import main; main({MODULES!r}, {IDLE_TIME!r})"
-                self._worker = start_process(program, environment=_ENVIRONMENT, has_threads=True)
-            with socket.socket(fileno=os.dup(self._worker.link.fileno())) as control, contextlib.suppress(OSError):
+            worker = self.start(failed)
+            with socket.socket(fileno=os.dup(worker.link.fileno())) as control, contextlib.suppress(OSError):
                 place = os.open(".", os.O_PATH)
                 try:
                     socket.send_fds(control, [b"r"], [theirs.fileno(), result, place])
                 finally:
                     os.close(place)
-            return ours, self._worker
+            return ours, worker
 
     def stop(self) -> None:
         """End the server; running calls go on to their end."""
@@ -106,6 +111,12 @@ class _Server:
 
 _server = _Server()
 atexit.register(_server.stop)
+
+
+def start_server() -> None:
+    """Start the server ahead of the first call, so that its imports, of 2 s, run beside the caller's. Faults are left to that call."""
+    with _server._lock, contextlib.suppress(OSError):
+        _server.start()
 
 
 def run_isolated(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], limits: Limits) -> Iterator[Any]:
