@@ -264,7 +264,7 @@ def test_a_stale_models_info_is_named_and_not_copied(tmp_path, info, said):
     assert catalog.entries[0].diameter == pytest.approx(0.1183, rel=1e-3)
     assert len(lines) == bool(said)
     assert said in "".join(lines)
-    write_models(tmp_path / "out", catalog)
+    write_models(catalog, tmp_path / "out")
     written = json.loads((tmp_path / "out" / "models_info.json").read_text())["1"]
     sizes = "symmetries" not in said and said
     assert written == info if not sizes else written["diameter"] == pytest.approx(118.3, rel=1e-3)
@@ -288,7 +288,7 @@ def test_an_object_without_an_entry_goes_without_symmetries(tmp_path):
     catalog, lines = load_models(folder, tmp_path)
     assert [len(entry.symmetries_discrete) for entry in catalog.entries] == [1, 0, 0]
     assert [line.rpartition("; ")[2] for line in lines] == ["until then it has no symmetries"] * 2
-    write_models(tmp_path / "out", catalog)
+    write_models(catalog, tmp_path / "out")
     written = json.loads((tmp_path / "out" / "models_info.json").read_text())
     assert written["3"]["diameter"] == pytest.approx(86.6, rel=1e-3)
     with pytest.raises(CatalogError, match="no entry for object 2"):

@@ -303,7 +303,7 @@ def test_textures_outside_of_the_folder_or_that_no_bake_can_use_are_refused(tmp_
 def test_a_texture_that_is_read_is_copied_into_the_set(tmp_path, line):
     folder = folder_of(tmp_path, line)
     catalog = load_models(folder, tmp_path)[0]
-    write_models(tmp_path / "models", catalog)
+    write_models(catalog, tmp_path / "models")
     assert (tmp_path / "models" / line.split()[-1]).read_bytes() == picture()
     assert (tmp_path / "models" / "obj_000001.ply").read_bytes() == (folder / "obj_000001.ply").read_bytes()
     again = load_models(tmp_path / "models", tmp_path)[0]
@@ -318,12 +318,12 @@ def test_only_the_texture_that_was_read_is_copied(tmp_path):
     for number, content in enumerate((other, b"no picture")):
         (folder / "skin.png").write_bytes(content)
         with pytest.raises(CatalogError, match=r"changed since it was read|not readable as an image"):
-            write_models(tmp_path / f"models{number}", catalog)
+            write_models(catalog, tmp_path / f"models{number}")
         assert not (tmp_path / f"models{number}" / "skin.png").exists()
     (folder / "obj_000001.ply").write_bytes(ply("comment TextureFile ../../evil.png"))
     (tmp_path / "set").mkdir()
     with pytest.raises(CatalogError, match="names the file"):
-        write_models(tmp_path / "set" / "models", catalog)
+        write_models(catalog, tmp_path / "set" / "models")
     assert [path.name for path in (tmp_path / "set").iterdir()] == ["models"]
 
 

@@ -276,7 +276,7 @@ def test_detected_symmetries_reach_models_info_and_evaluation(tmp_path, name, me
     assert said in line
     assert "; they move its surface by up to " in line
     (tmp_path / "set").mkdir()
-    write_models(tmp_path / "set" / "models", catalog)
+    write_models(catalog, tmp_path / "set" / "models")
     info = read_models_info(tmp_path / "set" / "models" / "models_info.json", [1])[1]
     assert info.symmetries_continuous == ((((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)),) if is_bop else ())
     assert len(info.symmetries_discrete) == discrete

@@ -407,7 +407,7 @@ def test_split_vertices_leave_mass_collision_and_models_as_they_are(tmp_path):
     places, faces = merge_positions(other.mesh.vertices, other.mesh.faces)
     assert trimesh.Trimesh(places, faces, process=False).is_watertight
     catalog = load_models(file.parent, tmp_path)[0]
-    write_models(tmp_path / "out", catalog)
+    write_models(catalog, tmp_path / "out")
     again, *_ = read_mesh(tmp_path / "out" / "obj_000001.ply", 1e-3)
     assert np.array_equal(again.normals, other.mesh.normals)
     exported = trimesh.load_mesh(tmp_path / "out" / "obj_000001.ply")

@@ -145,8 +145,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 NOTES_FILE: describe_dataset(context.settings, context.catalog, self._cameras),
                 PARAMS_FILE: format_dataset_params(context.settings, context.catalog, self._cameras),
             }
-            for name in MODEL_FOLDERS:
-                write_models(self._out / name, context.catalog, self._bop.graph)
+            write_models(context.catalog, *(self._out / name for name in MODEL_FOLDERS), mechanics=self._bop.graph)
             write_cameras(self._out, context.layout, self._cameras, self._bop.depth_scale)
             for name, text in texts.items():
                 (self._out / name).write_text(text, encoding="utf-8", newline="\n")

@@ -229,12 +229,12 @@ def test_bop_models_are_copied_byte_for_byte(tmp_path):
     (source / "models_info.json").write_text(json.dumps(info))
     entry = replace(entry, source=source / "obj_000003.ply")
     with pytest.raises(CatalogError, match=r"refers to 'label\.png', but there is no file"):
-        write_models(tmp_path / "without", Catalog((entry,)))
+        write_models(Catalog((entry,)), tmp_path / "without")
     # Read without its texture, which was missing: a copy would name it.
-    write_models(tmp_path / "plain", Catalog((replace(entry, material=replace(entry.material, texture=None)),)))
+    write_models(Catalog((replace(entry, material=replace(entry.material, texture=None)),)), tmp_path / "plain")
     assert b"TextureFile" not in (tmp_path / "plain" / "obj_000003.ply").read_bytes()
     (source / "label.png").write_bytes(label)
-    write_models(tmp_path / "models", Catalog((entry,)))
+    write_models(Catalog((entry,)), tmp_path / "models")
     assert (tmp_path / "models/obj_000003.ply").read_bytes() == model
     assert (tmp_path / "models/label.png").read_bytes() == label
     assert load(tmp_path / "models/models_info.json") == info

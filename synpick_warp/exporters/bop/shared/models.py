@@ -15,10 +15,11 @@ from synpick_warp.exporters.bop.view import MILLIMETERS
 from synpick_warp.exporters.writing.notes import describe_lenses, describe_sizes
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.assets.appearance import decode_texture, tint
-from synpick_warp.scenes.assets.asset_files import MissingFileError
+from synpick_warp.scenes.assets.asset_files import MissingFileError, quiet_decoding
 from synpick_warp.scenes.assets.models_info import corrected_entry, read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry
+from synpick_warp.system.hardware.cores import map_in_threads
 from synpick_warp.system.inputs.files import make_folder, path_inside
 from synpick_warp.system.inputs.image_files import TEXTURE_KINDS
 from synpick_warp.views.layer_codec import layer_notes
@@ -27,29 +28,30 @@ MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders the first and evaluates with the second; ours are equal."""
 
 
-def write_models(folder: Path, catalog: Catalog, mechanics: bool = False) -> None:
-    """Write every object's PLY file and texture, and models_info.json, with the keys of `make_mechanics` if `mechanics`, in place of a
-    folder that there may be.
+def write_models(catalog: Catalog, *folders: Path, mechanics: bool = False) -> None:
+    """Write every object's PLY file and texture, and models_info.json, with the keys of `make_mechanics` if `mechanics`, into each of the
+    folders, in place of one that there may be.
 
     Models loaded from BOP models are copied byte for byte, and their entries as they are, if these have the sizes of the meshes. Raises
     CatalogError if a model file or its texture is not what was read for the catalog.
     """
-    if folder.exists():
-        shutil.rmtree(folder)
-    folder.mkdir()
+    for folder in folders:
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.mkdir()
     infos = {}
-    for entry in catalog.entries:
-        path = folder / f"obj_{entry.obj_id:06d}.ply"
-        if entry.source is None:
-            path.write_bytes(encode_model(entry))
-            if entry.material.texture is not None:
-                path.with_suffix(".png").write_bytes(encode_png(tint(entry.material.texture, entry.material.color)))
-        else:
-            _copy_model(entry, entry.source, path)
+    with quiet_decoding():  # Around the threads, too: filters of warnings are the process's, and each thread restores what it found.
+        files = map_in_threads(_make_files, catalog.entries)
+    for entry, (model, texture) in zip(catalog.entries, files, strict=True):
+        for path in (folder / f"obj_{entry.obj_id:06d}.ply" for folder in folders):
+            if texture is not None:
+                _write_texture(path, entry.source or path, *texture)
+            path.write_bytes(model)
         known = read_entries(entry.source.parent / "models_info.json") if entry.source else None
         info = corrected_entry((known or {}).get(str(entry.obj_id)), make_model_info(entry))
         infos[str(entry.obj_id)] = info | make_mechanics(entry) if mechanics else info
-    (folder / "models_info.json").write_text(json.dumps(infos, indent=2) + "\n", encoding="ascii")
+    for folder in folders:
+        (folder / "models_info.json").write_text(json.dumps(infos, indent=2) + "\n", encoding="ascii")
 
 
 def encode_model(entry: CatalogEntry) -> bytes:
@@ -119,32 +121,34 @@ def make_mechanics(entry: CatalogEntry) -> dict[str, Any]:
     return info
 
 
-def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
-    """Copy a PLY file, and the texture that its header names, under the same name inside the set; without that texture, write the object.
-
-    Raises CatalogError if the texture has changed or gone since it was read, or its name is not allowed or that of another file of the set.
-    """
+def _make_files(entry: CatalogEntry) -> tuple[bytes, tuple[str, bytes] | None]:
+    """An object's PLY file, and its texture's name and file: those that it was read from; without a source or its texture, new ones. Raises
+    CatalogError if the texture has changed or gone since it was read."""
+    source, texture, name = entry.source, entry.material.texture, f"obj_{entry.obj_id:06d}.png"
+    if source is None:
+        return encode_model(entry), None if texture is None else (name, encode_png(tint(texture, entry.material.color)))
     data = read_ply_file(source)
     try:
         found = read_ply_texture(data, source)
     except MissingFileError:
-        if entry.material.texture is not None:
+        if texture is not None:
             raise
-        path.write_bytes(encode_model(entry))  # The copy would name a texture that is not there.
-        return
-    if found is not None:
-        name, image = found
-        if not np.array_equal(decode_texture(image, str(source.parent / name)), np.asarray(entry.material.texture)):
-            raise CatalogError(f"{source}: its texture {name} changed since it was read; start again")
-        target = path_inside(path.parent, name, source, CatalogError)
-        if target.suffix[1:].lower() not in TEXTURE_KINDS or any(part.startswith(".") for part in Path(name).parts):
-            kinds = ", .".join(TEXTURE_KINDS)
-            raise CatalogError(f"{source} names the texture {name}; allowed: names without leading dots that end in .{kinds}; rename it")
-        if target.exists() and target.read_bytes() != image:
-            raise CatalogError(f"{source} names the texture {name}, but the set has another file of that name; rename it")
-        make_folder(target.parent)
-        target.write_bytes(image)
-    path.write_bytes(data)
+        return encode_model(entry), None  # The copy would name a texture that is not there.
+    if found is not None and not np.array_equal(decode_texture(found[1], str(source.parent / found[0])), np.asarray(texture)):
+        raise CatalogError(f"{source}: its texture {found[0]} changed since it was read; start again")
+    return data, found
+
+
+def _write_texture(path: Path, source: Path, name: str, image: bytes) -> None:
+    """Write a texture beside the PLY file `path`. Raises CatalogError: its name is not allowed or that of another file of the set."""
+    target = path_inside(path.parent, name, source, CatalogError)
+    if target.suffix[1:].lower() not in TEXTURE_KINDS or any(part.startswith(".") for part in Path(name).parts):
+        kinds = ", .".join(TEXTURE_KINDS)
+        raise CatalogError(f"{source} names the texture {name}; allowed: names without leading dots that end in .{kinds}; rename it")
+    if target.exists() and target.read_bytes() != image:
+        raise CatalogError(f"{source} names the texture {name}, but the set has another file of that name; rename it")
+    make_folder(target.parent)
+    target.write_bytes(image)
 
 
 def describe_dataset(settings: ExportSettings, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
