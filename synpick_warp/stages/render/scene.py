@@ -156,6 +156,13 @@ def pack_opacity(opacity: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.rint(level.reshape(-1) / 255.0 * int(OPACITY_MASK)).astype(np.uint32) << int(OPACITY_SHIFT)
 
 
+def packed_levels(material: Material) -> list[np.ndarray]:
+    """Mip pyramid of a material's texture, packed (H W) uint32 with its opacity; empty without a texture."""
+    chain, opacity = [] if material.texture is None else mip_levels(material.texture), material.opacity
+    packed = [pack_texels(level) for level in chain]
+    return packed if opacity is None else [color | pack_opacity(opacity, level.shape) for color, level in zip(packed, chain, strict=True)]
+
+
 def detail_levels(maps: np.ndarray) -> list[np.ndarray]:
     """Mip pyramid of maps (H, W, 4) uint8 as of `Material.maps`, packed (H W) uint32. The variance of the normals below a texel widens
     its roughness (Toksvig, 2005), as the squared GGX width, which is averaged."""
@@ -244,17 +251,14 @@ def build_meshes(
 
 def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device: wp.Device) -> Any:
     """The struct `Surfaces`: normals, uv, materials, mip-mapped textures; after those of the shapes, `materials` may have others."""
-    chains = map_in_threads(lambda material: mip_levels(material.texture) if material.texture is not None else [], materials)
+    chains = map_in_threads(packed_levels, materials)
     depth = max(1, *(len(chain) for chain in chains))
     first_texel = np.zeros((len(chains), depth), dtype=np.int32)
     texels: list[np.ndarray] = []
     details: list[np.ndarray] = []
     total = 0
     mapped = map_in_threads(lambda material: None if material.maps is None else detail_levels(material.maps), materials)
-    for row, (chain, levels) in enumerate(zip(chains, mapped, strict=True)):
-        packed = [pack_texels(image) for image in chain]
-        if (opacity := materials[row].opacity) is not None:
-            packed = [texels | pack_opacity(opacity, image.shape) for texels, image in zip(packed, chain, strict=True)]
+    for row, (packed, levels) in enumerate(zip(chains, mapped, strict=True)):
         texels += packed
         details += packed if levels is None else levels
         for level, image in enumerate(packed):
@@ -262,9 +266,9 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
             total += len(image)
     if all(levels is None for levels in mapped):
         details = [np.zeros(1, np.uint32)]
-    sizes = [(chain[0].shape[1], chain[0].shape[0]) if chain else (0, 0) for chain in chains]
+    sizes = [(0, 0) if each.texture is None else each.texture.shape[1::-1] for each in materials]
     surfaces = Surfaces()
-    surfaces.triangle = wp.array(np.concatenate([pack_triangles(shape) for shape in shapes]), dtype=wp.vec4, device=device)
+    surfaces.triangle = wp.array(np.concatenate(map_in_threads(pack_triangles, shapes)), dtype=wp.vec4, device=device)
     surfaces.color = wp.array(srgb_to_linear(np.array([m.color for m in materials])), dtype=wp.vec3, device=device)
     surfaces.metallic = wp.array([m.metallic for m in materials], dtype=wp.float32, device=device)
     surfaces.roughness = wp.array([m.roughness for m in materials], dtype=wp.float32, device=device)
