@@ -92,7 +92,7 @@ context._resolve_launch_block_dim = _resolve_block
 
 def rank_contacts(pipeline: newton.CollisionPipeline) -> None:
     """Have a pipeline sort its contacts by their ranks on a GPU, if they are few; the order is the same."""
-    sorter = pipeline._contact_sorter
+    sorter: Any = pipeline._contact_sorter
     if sorter is not None and pipeline.model.device.is_cuda and sorter._capacity <= RANKED:
         sorter._sort_keys_copy.is_ranked = True
 
@@ -104,9 +104,9 @@ def sort_pairs(keys: wp.array, values: wp.array, count: int, begin_bit: int = 0,
         _radix_sort_pairs(keys, values, count, begin_bit, end_bit)
         return
     lanes = LANES if keys.device.is_cuda else 1
-    given: dict[str, Any] = {"outputs": [keys, values], "device": keys.device}
-    wp.launch(key_ranks.rank_keys_kernel, dim=(count, lanes), inputs=[count, lanes], **given)
-    wp.launch(key_ranks.take_sorted_kernel, dim=count, inputs=[count], **given)
+    rank, take, device = key_ranks.rank_keys_kernel, key_ranks.take_sorted_kernel, keys.device
+    wp.launch(rank, dim=(count, lanes), inputs=[count, lanes], outputs=[keys, values], device=device)
+    wp.launch(take, dim=count, inputs=[count], outputs=[keys, values], device=device)
 
 
 _radix_sort_pairs = wp.utils.radix_sort_pairs
