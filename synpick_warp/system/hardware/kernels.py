@@ -11,7 +11,6 @@ systems, and no reason to fail.
 import atexit
 import contextlib
 import fcntl
-import inspect
 import os
 import shutil
 import sys
@@ -25,7 +24,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import warp as wp
-from warp._src import codegen, context
+from warp._src import context
 
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.hardware.cores import count_cores
@@ -245,34 +244,7 @@ def _find_references(module: wp.Module, adjoint: Any, find: Callable[..., None] 
         find(module, adjoint)
 
 
-_SOURCE = ("source", "source_lines", "fun_lineno", "fun_name", "tree", "_shared_source")
-"""Attributes of an adjoint (Warp's syntax tree of a function) that have its source code."""
-
-
-def _make_adjoint(adjoint: Any, func: Any, *given: Any, make: Callable[..., None] = codegen.Adjoint.__init__, **options: Any) -> None:
-    """Make an adjoint, of Newton's functions without source code (lazy loading), which `_read_source` adds when it is hashed or compiled: a
-    bake launches a fifth of the 1,500, and to parse all takes a tenth of the CPU time of its imports. `wp.static` is evaluated at once."""
-    lazy = (func.__module__ or "").startswith("newton.") and "static" not in inspect.unwrap(func).__code__.co_names
-    lazy = lazy and not (options.get("source") or options.get("transformers"))
-    make(adjoint, func, *given, **options | ({"source": "def stub(): ..."} if lazy else {}))
-    for name in _SOURCE if lazy else ():
-        delattr(adjoint, name)
-
-
-def _read_source(adjoint: Any, name: str) -> Any:
-    """Read the source code of an adjoint as of `_make_adjoint`, once for all of the same code; Python calls this for missing attributes."""
-    if name not in _SOURCE:
-        raise AttributeError(f"an adjoint has no {name}")
-    code = inspect.unwrap(adjoint.func).__code__
-    shared = codegen._shared_source_for_code(code) or codegen._SharedFunctionSource(*adjoint.extract_function_source(adjoint.func))
-    codegen._store_shared_source(code, shared)
-    source, tree = shared.source, shared.tree
-    vars(adjoint).update(zip(_SOURCE, (source, source.splitlines(), shared.fun_lineno, tree.body[0].name, tree, shared), strict=True))
-    return vars(adjoint)[name]
-
-
 wp.Module._find_references = _find_references  # type: ignore[method-assign]
-codegen.Adjoint.__init__, codegen.Adjoint.__getattr__ = _make_adjoint, _read_source  # type: ignore[method-assign]
 
 
 @contextlib.contextmanager
