@@ -19,6 +19,7 @@ from newton._src.solvers.steel import solver_steel  # noqa: F401  (Newton import
 from warp._src import context
 
 from synpick_warp.kernels.newton_patches import contact_matching, key_ranks
+from synpick_warp.kernels.newton_patches.solver_iterations import WARP
 from synpick_warp.system.hardware.kernels import ModuleBuild, build_of, split_modules
 
 # Of the kernels in these modules of Newton, a bake launches a fifth.
@@ -38,9 +39,8 @@ world has some 60 pairs, about as many as its two blocks have threads."""
 SMALL_BLOCK = 64
 """Threads a block of `small_blocks`."""
 RANKED = 1 << 15
-"""Contacts, at most, whose keys are sorted by their ranks, in a time that grows with the square of their number: those of 64 worlds."""
-LANES = 32
-"""Threads of a warp."""
+"""Maximum capacity for contacts, that of 64 worlds, up to which their keys are sorted by rank; the time is quadratic in the number of
+contacts."""
 REFINE_BLOCK = 32
 """Block size of the narrow phase's refinement in Newton; its kernel takes longer to compile than any other."""
 _BUILDERS = {
@@ -91,19 +91,19 @@ context._resolve_launch_block_dim = _resolve_block
 
 
 def rank_contacts(pipeline: newton.CollisionPipeline) -> None:
-    """Have a pipeline sort its contacts by their ranks on a GPU, if they are few; the order is the same."""
+    """Replace the radix sort of a pipeline's contacts by a rank sort, with the same order, on a GPU and up to a capacity of `RANKED`."""
     sorter: Any = pipeline._contact_sorter
     if sorter is not None and pipeline.model.device.is_cuda and sorter._capacity <= RANKED:
         sorter._sort_keys_copy.is_ranked = True
 
 
 def sort_pairs(keys: wp.array, values: wp.array, count: int, begin_bit: int = 0, end_bit: int | None = None) -> None:
-    """Sort keys with their values; arguments as of Warp's `radix_sort_pairs`, in whose place it stands. Values of ranked keys are those of
-    Newton's contact sorter, 0, 1, 2, ..."""
+    """Sort key-value pairs in place of Warp's `radix_sort_pairs`, with its arguments. Keys marked by `rank_contacts` are sorted by rank;
+    their values must be 0, 1, 2, ..., as in Newton's contact sorter."""
     if not getattr(keys, "is_ranked", False):
         _radix_sort_pairs(keys, values, count, begin_bit, end_bit)
         return
-    lanes = LANES if keys.device.is_cuda else 1
+    lanes = int(WARP) if keys.device.is_cuda else 1
     rank, take, device = key_ranks.rank_keys_kernel, key_ranks.take_sorted_kernel, keys.device
     wp.launch(rank, dim=(count, lanes), inputs=[count, lanes], outputs=[keys, values], device=device)
     wp.launch(take, dim=count, inputs=[count], outputs=[keys, values], device=device)

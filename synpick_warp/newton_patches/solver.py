@@ -15,9 +15,9 @@ from synpick_warp.kernels.newton_patches import contact_rows, contact_sweep, sol
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.friction_patches import sort_by_worlds
 
-RESIDENT_WARPS, FEWEST_WARPS = 10, 2
-"""Warps of the iterations that a multiprocessor can run at a time: its 65,536 registers hold 10 with up to 200 a thread; fewest of a world.
-Where there are more worlds, those with the most contact colors start first, or they would run on alone at the end."""
+RESIDENT_WARPS = 10
+"""Warps of the iterations that run on a multiprocessor at the same time: 65,536 registers, up to 200 per thread. If more worlds are
+simulated, those with the most contact colors start first; otherwise they would finish last, on an idle GPU."""
 PATCH_WARP_CONTACTS = 8
 """Number of contacts of two bodies above which a warp grows their friction patches, and not a thread; Newton's is 32. The patches are the
 same, in four fifths of the time (2,048 worlds, H200)."""
@@ -38,15 +38,15 @@ OFFSETS = int(steel.PROPAGATION_COLOR_TAIL) + 2
 
 
 class FusedSteel(newton.solvers.SolverSteel):
-    """SolverSteel whose projected Gauss-Seidel iterations run in one kernel, with one block per world.
+    """SolverSteel with all projected Gauss-Seidel (PGS) iterations of a substep fused into one kernel, one block per world.
 
-    SolverSteel launches ten kernels per iteration: with 16 iterations, 160 of the 364 launches of a substep. Each waits for the one before
-    it, for microseconds on an idle GPU, and longer beside a renderer. `solver_iterations` calls the same device functions one after the
-    other, but for the sweep over contacts, which keeps them in registers (`contact_sweep`) and solves their friction rows by Newton's
-    method (`friction`). With the solver's own search for friction, results are bitwise identical. The warm start has more threads.
+    SolverSteel launches ten kernels per iteration: with 16 iterations, 160 of the 364 launches of a substep. Each waits some microseconds
+    for the previous one, and longer while a renderer uses the GPU. `solver_iterations` calls the same device functions, except for
+    contacts: their sweep keeps them in registers (`contact_sweep`) and solves friction by Newton's method (`friction`). With the solver's
+    own friction solve, results are bitwise identical. The warm start uses more threads.
 
     Supported are models of identical worlds, each with one articulation besides its free bodies, and the options that
-    `physics.make_solver` sets. Others, such as piles without a gripper, run SolverSteel's own kernels.
+    `physics.make_solver` sets. For other models, such as piles without a gripper, SolverSteel's own kernels run.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -147,9 +147,9 @@ class FusedSteel(newton.solvers.SolverSteel):
 
     @cached_property
     def _sweep_warps(self) -> int:
-        """Warps that sweep the contacts of a world: four, or fewer if four of all worlds do not run at a time."""
-        most = RESIDENT_WARPS * self.model.device.sm_count // self._world_count
-        return min(max(most, FEWEST_WARPS), contact_sweep.WARPS_OF_MANY) if keeps_rows_shared(self) else contact_sweep.WARPS_OF_MANY
+        """Warps per world: as many as run at the same time for all worlds, 1 to `MAX_WARPS`; with rows in global memory `MAX_WARPS`."""
+        fitting = RESIDENT_WARPS * self.model.device.sm_count // self._world_count
+        return min(max(fitting, 1), contact_sweep.MAX_WARPS) if keeps_rows_shared(self) else contact_sweep.MAX_WARPS
 
     @cached_property
     def _is_fusable(self) -> bool:
@@ -333,7 +333,7 @@ def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
 
 @cache
 def compose_kernel(
-    rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, propagation: wp.Kernel, warps: int = contact_sweep.WARPS_OF_MANY
+    rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, propagation: wp.Kernel, warps: int = contact_sweep.MAX_WARPS
 ) -> wp.Kernel:
     """Kernel of the iterations from the sweep over contacts by `warps` a block, and kernels of the solver, each of which calls one device
     function."""
@@ -347,8 +347,8 @@ def compose_kernel(
 
 
 @cache
-def compose_contacts(rows: int, bodies: int, stages_rows: bool = True, warps: int = contact_sweep.WARPS_OF_MANY) -> wp.Function:
-    """Sweep over the contacts of a world with at most `rows` rows and `bodies` bodies; others as of `compose_contact_sweep`."""
+def compose_contacts(rows: int, bodies: int, stages_rows: bool = True, warps: int = contact_sweep.MAX_WARPS) -> wp.Function:
+    """Device function of the contact sweep, with the color offsets of SolverSteel; arguments as in `compose_contact_sweep`."""
     return contact_sweep.compose_contact_sweep(rows, bodies, OFFSETS, stages_rows=stages_rows, warps=warps)
 
 

@@ -57,7 +57,7 @@ def complete(device, contacts: list[tuple[int, float, tuple]], match: list[int])
 
 @pytest.mark.parametrize(("count", "bits"), [(0, 1), (1, 1), (33, 3), (700, 40), (1000, 4)])
 def test_contacts_sorted_by_ranks_are_in_the_order_of_a_stable_sort(device, count, bits):
-    """Random keys, some equal, in front of unused slots, as NumPy and Warp's radix sort order them."""
+    """Random keys with duplicates, followed by unused slots; known: the orders of NumPy's stable sort and of Warp's radix sort."""
     capacity = 1000
     random = np.full(2 * capacity, int(UNUSED))
     random[:count] = np.random.default_rng(count).integers(0, 1 << bits, count)

@@ -222,7 +222,9 @@ class DepthSensor:
     preset: str = setting(
         "", "Sensor of [configs/calibration/sensors.toml](calibration/sensors.toml): sets what is not set here.", choices=("", *SENSORS)
     )
-    baseline: Annotated[float, "(0, 1] m"] = setting(0.075, "Distance from the camera to the projector at its right, or the right camera.")
+    baseline: Annotated[float, "(0, 1] m"] = setting(
+        0.075, "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012), or to the right camera."
+    )
     disparity_step: Annotated[float, "(0, 16] px"] = setting(
         0.125, "Disparity quantization: depth steps of z² / (f · baseline) times this (Khoshelham and Elberink, 2012)."
     )
@@ -254,8 +256,8 @@ class DepthSensor:
     )
     multipath: Fraction = setting(
         0.0,
-        "Share of light from mirrored second surfaces that is not rejected: metal corners are measured too deep (Freedman et al., 2014), "
-        "with holes where it outweighs direct light (layer depth_sensor).",
+        "Fraction of light over a second, mirrored surface that is not rejected: metal corners are measured too deep (Freedman et al., "
+        "2014); holes where it exceeds direct light (layer depth_sensor).",
     )
     registration: Fraction = setting(
         0.0,

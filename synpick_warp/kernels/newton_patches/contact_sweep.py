@@ -1,10 +1,10 @@
-"""Colored Gauss-Seidel sweep over the contacts of a world by the warps of a block, each of which keeps 32 contacts in registers.
+"""Graph-colored Gauss-Seidel sweep over the contacts of a world by one block, with one contact per thread in registers.
 
-Newton's SolverSteel loads the contacts of one color, solves them, and goes on with the next color. Piles have many colors of few contacts:
-an object of many convex pieces lies on the tote with 20 contacts, each of a color of its own, and each color waits for memory. Here each
-thread loads one contact, in the order of colors, and the warps take turns to solve the colors among theirs one after the other. Where no
-contact touches the gripper, contacts and twists stay in registers and shared memory for all iterations. Contacts beyond the threads of a
-block are prefetched, and loaded in each iteration. The arithmetic is the solver's, bit by bit, but for the friction rows (`friction`).
+Newton's SolverSteel loads and solves the contacts of one color after another. Piles have many colors of few contacts: an object of many
+convex pieces rests on the tote with 20 contacts, each of its own color, and each color waits for memory. Here contacts are sorted by
+color, each thread loads one, and the warps take turns: a warp solves its colors in sequence while the others wait. If no contact involves
+the gripper, contacts stay in registers and twists in shared memory for all iterations. Worlds with more contacts than a block has threads
+load them again in each iteration, and prefetch the next ones. Results are bitwise those of the solver, except for friction (`friction`).
 """
 
 import warp as wp
@@ -32,9 +32,9 @@ HAS_FRICTION = f"record[{KIND}] == {WITH_FRICTION}"
 MAX_SHARED_ROWS = 3072
 """Maximum number of rows of a world whose impulses and lists of patch members lie in shared memory: they take 24 of the 48 KB of a block.
 Those of more rows lie in global memory, and are prefetched to the L1 cache."""
-WARPS_OF_MANY = 4
-"""Warps of a block, which sweeps a world, where rows lie in global memory: contacts of one color in all of them are solved at once. Of
-3,600 contacts, a color has 50. Two such blocks fit into the registers of a multiprocessor."""
+MAX_WARPS = 4
+"""Maximum warps of a block. Two such blocks fit into the registers of a multiprocessor. Worlds whose rows lie in global memory always have
+that many, and solve a color in all of them at once: of 3,600 contacts, a color has 50."""
 SECTOR = 8
 """Words that a prefetch brings to the L1 cache at least: 32 bytes."""
 TWIST_STRIDE = 8
@@ -48,7 +48,7 @@ def shared_bytes(rows: int, bodies: int, stages_rows: bool = True) -> int:
 
 
 def compose_contact_sweep(
-    rows: int, bodies: int, offsets: int, friction: str = SOLVE_FRICTION, stages_rows: bool = True, warps: int = WARPS_OF_MANY
+    rows: int, bodies: int, offsets: int, friction: str = SOLVE_FRICTION, stages_rows: bool = True, warps: int = MAX_WARPS
 ) -> wp.Function:
     """Create the sweep over the contacts of a world, for a GPU: all iterations of a solve in one launch, with a block for each world.
 
@@ -62,7 +62,7 @@ def compose_contact_sweep(
             contacts.
         friction: Source of the function `solve_friction`.
         stages_rows: Whether impulses and patch lists lie in shared memory; the arithmetic is the same.
-        warps: Warps of a block, which change no result.
+        warps: Warps of a block; they do not affect the result.
 
     Raises:
         ValueError: `rows` exceeds `MAX_SHARED_ROWS`, and they are to lie in shared memory.
@@ -80,10 +80,10 @@ def compose_contact_sweep(
         twist_inout: wp.array2d[float],
         impulse_inout: wp.array2d[float],
     ) -> int:
-        """Gauss-Seidel sweep over the contacts of a world: updates the impulses of rows and bodies, and the twists, by one block.
+        """Gauss-Seidel sweeps over the contacts of a world by one block: update the impulses of rows and bodies, and the twists.
 
-        Returns the number of iterations: all that are left if nothing but contacts changes velocities between them, one otherwise.
-        `is_alone`: the world has no other rows.
+        Returns the number of iterations done: all remaining ones if only contacts change velocities in the world, otherwise one.
+        `is_alone`: the world has no constraint rows besides contacts.
         """
         ...
 
@@ -138,8 +138,8 @@ def _source(rows: int, bodies: int, offsets: int, friction: str, stages_rows: bo
 {_FIND_COLORS.replace("OFFSETS", str(offsets))}
     }}
 {_LOAD_BODIES}
-    const bool is_last = !__syncthreads_or(touches) && is_alone;
-    const int stop = is_last ? end_iteration : iteration + 1;
+    const bool has_gripper = __syncthreads_or(holds_gripper);
+    const int stop = is_alone && !has_gripper ? end_iteration : iteration + 1;
 {_DECLARE}
     for (int now = iteration; now < stop; ++now)
     for (int first = 0; first < count; first += THREADS) {{
@@ -163,17 +163,17 @@ def _source(rows: int, bodies: int, offsets: int, friction: str, stages_rows: bo
 
 
 _LOAD_BODIES = f"""
-    bool touches = false;
+    bool holds_gripper = false;
     for (int i = lane; i < slots * 6; i += THREADS) {{
         const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * BODIES + slot];
         twists[slot * {TWIST_STRIDE} + component] = twist_inout.data[body * 6 + component];
         body_impulses[i] = impulse_inout.data[body * 6 + component];
         is_free[slot] = contacts.is_free.data[body];
-        touches |= !is_free[slot];
+        holds_gripper |= !is_free[slot];
     }}
     if (lane < {TWIST_STRIDE}) twists[BODIES * {TWIST_STRIDE} + lane] = 0.0f;
     is_free[BODIES] = true;"""
-"""Load the twists of a world's bodies, the impulses on them, and which ones are free; `touches`: one of them is not."""
+"""Load the twists of a world's bodies, their impulses, and which of them are free; `holds_gripper`: a body of this thread is not."""
 
 _STORE_BODIES = f"""
     for (int i = lane; i < slots * 6; i += THREADS) {{
@@ -186,7 +186,7 @@ _STORE_BODIES = f"""
 _DECLARE = f"""
     int record[{RECORD}], row0 = 0;
     float mass = 0.0f, mu = 0.0f, Ja[3][6] = {{0}}, Jb[3][6] = {{0}}, Ma[3][6], Mb[3][6], rhs[3], friction_operator[{FRICTION_OPERATOR}];"""
-"""Registers of the thread's contact."""
+"""Declare the registers of a thread's contact."""
 
 _LOAD = f"""
         // The next iteration begins with the first contacts again. The record of a contact is prefetched before its rows, which it tells.
@@ -247,7 +247,7 @@ _LOAD = f"""
             for (int k = 0; k < {FRICTION_OPERATOR}; ++k)
                 friction_operator[k] = __ldg(&contacts.friction_operator.data[(first_row + index) * {FRICTION_OPERATOR} + k]);
         }}"""
-"""Load the thread's contact; prefetch the one of the next block of them, and the record of the one after it."""
+"""Load a thread's contact; prefetch its next one, `THREADS` places further, and the record of the one after that."""
 
 _FIND_COLORS = """
         if (lane < 32)
@@ -264,8 +264,8 @@ _FIND_COLORS = """
             for (int distance = 16; distance > 0; distance /= 2) starts |= __shfl_xor_sync(~0u, starts, distance);
             if (lane == 0) color_starts[first / 32] = starts;
         }"""
-"""Find where colors start among each 32 contacts, as bits, by the first warp; `color` is the first color that does not start before
-them."""
+"""Mark the first contact of each color by a bit, in a word for each 32 contacts, by the first warp. `color`: the first color that starts
+in the word or later."""
 
 
 def _dot(row: int) -> str:
@@ -372,7 +372,7 @@ _SOLVE = f"""
                         sum = fmaf(Jb[1][k], change1, fmaf(Jb[2][k], change2, fmaf(Jb[0][k], change0, sum)));
                     }}
                 }}"""
-"""Solve the thread's contact: its normal row, then its two friction rows together, whose responses are added in the order of the solver."""
+"""Solve a thread's contact: first its normal row, then both friction rows at once; their responses are added in the solver's order."""
 
 _VISIT_IN_TURN = f"""
         for (int turn = 0; turn < WARPS && first + 32 * turn < count; ++turn) {{
@@ -390,7 +390,7 @@ _VISIT_IN_TURN = f"""
             }}
             __syncthreads();
         }}"""
-"""Solve the colors among the contacts of one warp after the other."""
+"""Solve the contacts of one warp after another, each color by color; a barrier separates the warps."""
 
 _VISIT_AT_ONCE = f"""
         unsigned starts = color_starts[first / 32] & ~1u;
@@ -404,4 +404,4 @@ _VISIT_AT_ONCE = f"""
             starts &= starts - 1;
             begin = end;
         }}"""
-"""Solve the colors among the contacts of all warps one after the other, which may reach from one warp to the next."""
+"""Solve the contacts of all warps color by color, with a barrier after each color. A color may span several warps."""

@@ -1,7 +1,7 @@
 """Rank sort (enumeration sort, Muller and Preparata, 1975) of contact keys on a GPU, for few contacts.
 
-A radix sort takes twelve dependent kernels however few keys there are: 63 us of a substep of 8 worlds on an H200. Here each key counts
-those before it, with a warp for each key, and goes to its place.
+A radix sort launches twelve dependent kernels, however few keys there are: 63 us of a substep of 8 worlds on an H200, 9 us by ranks. The
+rank of a key is the number of keys that precede it; a warp counts them for each key.
 """
 
 import warp as wp
@@ -9,15 +9,14 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 UNUSED = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
-"""Newton's key of slots without a contact, which are behind all others."""
+"""Sort key of Newton's unused contact slots, larger than that of any contact."""
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return __reduce_add_sync(~0u, value);
-#else
-    return value;
+    for (int distance = 16; distance > 0; distance /= 2) value += __shfl_xor_sync(~0u, value, distance);
 #endif
+    return value;
 """)
 def sum_lanes(value: int) -> int:
     """Sum of `value` over the lanes of a warp. On the CPU a warp has one lane."""
@@ -33,9 +32,9 @@ def rank_keys_kernel(
     key_inout: wp.array[wp.int64],  # (2 * capacity)
     index_inout: wp.array[int],  # (2 * capacity)
 ):
-    """Write keys and their indices in ascending order behind the `capacity` unsorted ones; of equal keys, the first comes first.
+    """Rank sort, stable: write the sorted keys and their original indices to the second half of the arrays. `lanes`: threads of a key.
 
-    Launched over key, lane; on a CPU there is one lane."""
+    The first half has the keys of all contacts, then `UNUSED`. Launched over key, lane; a warp is the lanes of one key."""
     place, lane = wp.tid()
     key = key_inout[place]
     if key == UNUSED:
@@ -63,7 +62,7 @@ def take_sorted_kernel(
     key_inout: wp.array[wp.int64],  # (2 * capacity)
     index_inout: wp.array[int],  # (2 * capacity)
 ):
-    """Copy the keys and indices that `rank_keys_kernel` has sorted to the first `capacity`. Launched over key."""
+    """Copy the result of `rank_keys_kernel` from the second half of the arrays to the first. Launched over key."""
     place = wp.tid()
     if key_inout[place] != UNUSED:
         key_inout[place] = key_inout[capacity + place]

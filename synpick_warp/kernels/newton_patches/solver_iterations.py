@@ -272,8 +272,9 @@ def compose_iterations(
         An iteration sweeps joint limits, contacts in generalized coordinates, colored contacts, the response of the gripper to these, and
         speed limits; sweeps without rows are skipped. Velocities of free bodies exist twice: in `v`, generalized velocities, and as twists.
         They are copied between the two in every iteration if a sweep over `v` can change them, otherwise before the first and after the
-        last one. Where no contact touches the gripper either, contacts have all iterations at once: the gripper's velocities would stay
-        as they are. `impulse_inout` ends as 0. Launched over rank, thread of a block: one block per world, worlds in `order`.
+        last one. If contacts are the only rows, and none involves the gripper, one call of `sweep_contacts` runs all iterations, as the
+        gripper's velocities stay constant. `impulse_inout` ends as 0. Launched over rank, thread of a block: one block per world, worlds
+        in `order`.
         """
         rank, lane = wp.tid()
         world = order[rank]

@@ -84,8 +84,8 @@ class LayerRenderer:
     def __init__(self, names: tuple[str, ...], sensor: Any, scene: RenderScene, instances: int, views: int, multipath: float = 0.0) -> None:
         """Allocate scratch, if a layer needs motions. `names`: layers to render, from `layers.LAYER_TABLE`. `sensor`: the struct
         `SensorParameters`. `scene`: constant data. `instances`: instance capacity of a world. `views`: largest number of views in a batch.
-        `multipath`: of the settings; not in `sensor`, whose kernels have no use for it. Raises CatalogError: `names` has classes, and an
-        obj_id is 0 or does not fit into 16 bits."""
+        `multipath`: setting of the depth sensor, not in `sensor`, as only one kernel uses it. Raises CatalogError: `names` has classes, and
+        an obj_id is 0 or does not fit into 16 bits."""
         self.scene = scene
         self.names = names
         self.sensor, self.multipath = sensor, multipath

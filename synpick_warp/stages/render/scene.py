@@ -157,7 +157,7 @@ def pack_opacity(opacity: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def packed_levels(material: Material) -> list[np.ndarray]:
-    """Mip pyramid of a material's texture, packed (H W) uint32 with its opacity; empty without a texture."""
+    """Mip pyramid of a material's texture with its opacity, each level packed as (H W) uint32; empty without a texture."""
     chain, opacity = [] if material.texture is None else mip_levels(material.texture), material.opacity
     packed = [pack_texels(level) for level in chain]
     return packed if opacity is None else [color | pack_opacity(opacity, level.shape) for color, level in zip(packed, chain, strict=True)]

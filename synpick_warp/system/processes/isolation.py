@@ -80,7 +80,7 @@ class _Server:
         self._worker: WorkerProcess | None = None
 
     def start(self, failed: WorkerProcess | None = None) -> WorkerProcess:
-        """The running server, started if there is none, or only the one that `failed`; the caller holds the lock. Raises OSError."""
+        """The running server; starts one if none runs, or if the running one is `failed`. The caller must hold the lock. Raises OSError."""
         if self._worker is None or self._worker is failed or self._worker.process.poll() is not None:
             self.stop()
             program = f"from synpick_warp.system.processes.isolation import main; main({MODULES!r}, {IDLE_TIME!r})"
@@ -114,7 +114,7 @@ atexit.register(_server.stop)
 
 
 def start_server() -> None:
-    """Start the server ahead of the first call, so that its imports, of 2 s, run beside the caller's. Faults are left to that call."""
+    """Start the server before the first call, so that its imports (2 s) overlap with the caller's. Errors are left to that call."""
     with _server._lock, contextlib.suppress(OSError):
         _server.start()
 

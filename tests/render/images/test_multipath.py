@@ -1,4 +1,4 @@
-"""Multipath interference of depth sensors: depth in a right-angled groove in closed form, holes, and where there is none."""
+"""Multipath interference of depth sensors: closed-form depth error in a right-angled groove, holes, and scenes without an error."""
 
 from dataclasses import replace
 
@@ -13,15 +13,15 @@ from tests.worlds.shapes import GREY, UPRIGHT, WHITE, entry, sheet, surface
 from tests.worlds.toy_scene import ToyScene
 
 SIDE, DEPTH = 0.6, 1.2
-"""Width of a groove's sheets, and depth of its edge [m]."""
+"""Side length of the two square sheets that form a groove, and distance of their common edge from the camera [m]."""
 METAL, DULL = surface(WHITE, 1.0, 0.6), surface(WHITE, 0.0, 1.0)
-"""White, so that the metal's specular albedo is 1."""
+"""Materials; white metal has a specular albedo of 1."""
 SEEN = slice(None), slice(8, 76)
-"""Pixels of the left sheet whose mirror rays meet the right one."""
+"""Rows and columns of the left sheet whose mirror rays hit the right sheet."""
 
 
 def groove(left: Material, right: Material, worlds: int = 1, bend: float = 1.0) -> ToyScene:
-    """Two sheets at a right angle, whose edge is on the optical axis: a groove, or a ridge with `bend` -1."""
+    """Scene of two sheets at a right angle with the common edge on the optical axis: a groove, or with `bend` -1 a ridge."""
     turn, half = bend * np.pi / 8.0, SIDE / 8**0.5
     rest, sides = (0.0, TOP - DEPTH + bend * half, 0.0), enumerate((-1.0, 1.0))
     placed = [(side, (sign * half, *rest, -sign * np.sin(turn), 0.0, np.cos(turn))) for side, sign in sides]
@@ -29,8 +29,8 @@ def groove(left: Material, right: Material, worlds: int = 1, bend: float = 1.0) 
 
 
 def predict(left: Material, right: Material, share: float, device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """NumPy twin: depth of the left sheet [m], weight of the indirect path, and depth that it would add alone. The right sheet is its own
-    mirror image: the straight ray meets it at |cp| + |pq|."""
+    """NumPy twin of the kernel: depth of the left sheet [m], weight of the indirect path, and its extra depth [m]. The right
+    plane, perpendicular to the left one, is its own mirror image, so the unreflected ray hits it at the distance |cp| + |pq|."""
     row, column = np.mgrid[:HEIGHT, :WIDTH][(slice(None), *SEEN)]
     ray = np.stack([(column + 0.5 - WIDTH / 2) / FOCAL, (HEIGHT / 2 - row - 0.5) / FOCAL, -np.ones(row.shape)], -1)
     normal, other = np.array([[1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]]) / 2**0.5
@@ -56,7 +56,7 @@ def test_a_metal_groove_deepens_as_the_twin_predicts(device, right, share, hole)
     assert ((weight > 0.5) == hole).all()
     assert (weight * extra).max() > 0.02
     np.testing.assert_allclose(measured.depth[0][SEEN], np.where(hole, np.nan, depth + weight * extra), atol=3.0 * COUNT)
-    # Truth stays.
+    # Ground truth is unaffected.
     np.testing.assert_allclose(measured.exact[0][SEEN], depth, atol=1e-5)
     np.testing.assert_allclose(measured.clean[0] * COUNT, measured.exact[0], atol=0.51 * COUNT)
 
@@ -70,7 +70,7 @@ def test_noise_is_that_without_multipath(device):
 
 
 def test_plastic_has_little_and_convex_metal_none(device):
-    """A rough dielectric's share is about its reflectance of 4 % over its colour and cosine."""
+    """Known: the weight of a rough dielectric is about its reflectance of 4 %, divided by its diffuse albedo and the cosine."""
     depth, _, extra = predict(GREY, DULL, 1.0, device)
     share = (measure(groove(GREY, DULL), device, **PERFECT, multipath=1.0).depth[0][SEEN] - depth) / extra
     assert 0.04 < share.min() < share.max() < 0.08
@@ -83,7 +83,7 @@ def test_coats_mirror_too_and_blocked_light_is_missing(device):
     settings, coated = PERFECT | {"multipath": 0.5}, replace(GREY, finish=Finish(1.0, 0.1))
     plain, coat = (measure(groove(left, DULL), device, **settings).depth[0][SEEN] for left in (GREY, coated))
     assert (coat > plain + 2.0 * COUNT).mean() > 0.9
-    # A plate between the right sheet and the projector.
+    # A plate occludes the right sheet from the projector.
     toy = groove(GREY, DULL)
     toy.entries, toy.placed = [*toy.entries, entry(sheet(0.4, 1.0))], [[*toy.placed[0], (2, (0.203, 0.0, TOP - 0.6, *UPRIGHT))]]
     without, blocked = (measure(toy, device, **PERFECT, multipath=share).counts[0][SEEN] for share in (0.0, 0.5))

@@ -29,11 +29,11 @@ MODEL_FOLDERS = ("models", "models_eval")
 
 
 def write_models(catalog: Catalog, *folders: Path, mechanics: bool = False) -> None:
-    """Write every object's PLY file and texture, and models_info.json, with the keys of `make_mechanics` if `mechanics`, into each of the
-    folders, in place of one that there may be.
+    """Write the PLY file and texture of each object, and models_info.json, into each folder; existing folders are replaced.
 
-    Models loaded from BOP models are copied byte for byte, and their entries as they are, if these have the sizes of the meshes. Raises
-    CatalogError if a model file or its texture is not what was read for the catalog.
+    Models read from BOP files are copied byte for byte. So are their entries in models_info.json, if these agree with the meshes' sizes.
+    `mechanics`: whether entries also have the keys of `make_mechanics`. Raises CatalogError: a model file or its texture has changed
+    since it was read.
     """
     for folder in folders:
         if folder.exists():
@@ -122,8 +122,9 @@ def make_mechanics(entry: CatalogEntry) -> dict[str, Any]:
 
 
 def _make_files(entry: CatalogEntry) -> tuple[bytes, tuple[str, bytes] | None]:
-    """An object's PLY file, and its texture's name and file: those that it was read from; without a source or its texture, new ones. Raises
-    CatalogError if the texture has changed or gone since it was read."""
+    """Contents of an object's PLY file, and name and contents of its texture file (None: it has no texture). They are those of the source
+    files; embedded objects, and models whose texture was missing, are encoded anew. Raises CatalogError: the texture has changed or is
+    missing now."""
     source, texture, name = entry.source, entry.material.texture, f"obj_{entry.obj_id:06d}.png"
     if source is None:
         return encode_model(entry), None if texture is None else (name, encode_png(tint(texture, entry.material.color)))

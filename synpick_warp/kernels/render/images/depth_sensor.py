@@ -147,6 +147,17 @@ def quantize_depth(sensor: SensorParameters, focal_baseline: float, depth: float
 
 
 @wp.func
+def read_out(layer: LayerScene, shot: AnyShot, view: int, row: int, column: int, depth: float, cosine: float, bias: float) -> wp.uint16:
+    """Measured depth of a pixel in counts, with axial noise, noise of disparity and disparity steps; 0: outside of the measuring range.
+    `cosine`: of the angle of incidence. `bias`: systematic error of the depth [m]."""
+    sensor, key = layer.sensor, shot_key(layer.sensor.seed, shot, view, Stream.DEPTH_NOISE)
+    noise = lattice_normals(key, shot.grid, sensor.noise_width, row, column, 2)
+    noisy = depth + bias + axial_noise(sensor, depth, cosine) * noise[0]
+    counts = sensor.counts_per_meter * quantize_depth(sensor, shot.views.cameras.intrinsics[view][0] * sensor.baseline, noisy, noise[1])
+    return wp.uint16(wp.where(wp.rint(counts) <= MAX_COUNTS, wp.rint(counts), 0.0))
+
+
+@wp.func
 def sensor_depth_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.uint16:
     """Simulate a structured-light depth image: disparity d = f b / (z + σ n) + σ' n', rounded to steps; n and n' are standard normal.
 
@@ -172,10 +183,7 @@ def sensor_depth_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int
     if sensor.shadows != 0:
         if in_shadow(layer, shot, focal_baseline, view, at_row, at_column):
             return wp.uint16(0)
-    noise = lattice_normals(key, grid, sensor.noise_width, row, column, 2)
-    noisy = depth + axial_noise(sensor, depth, cosine) * noise[0]
-    counts = wp.rint(sensor.counts_per_meter * quantize_depth(sensor, focal_baseline, noisy, noise[1]))
-    return wp.uint16(wp.where(counts <= MAX_COUNTS, counts, 0.0))
+    return read_out(layer, shot, view, row, column, depth, cosine, 0.0)
 
 
 render_depth_sensor_kernel = kernel_of_layer(sensor_depth_at, "depth_sensor", wp.uint16)

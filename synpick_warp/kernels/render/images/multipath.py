@@ -1,6 +1,7 @@
-"""Multipath interference of a depth sensor: light of its projector that takes a second way to a pixel, by the mirror image of a surface.
+"""Multipath interference of depth sensors: projector light that reaches a pixel indirectly, over a second surface seen in specular
+reflection.
 
-A module of its own, since sensors without it need `images.depth_sensor` alone.
+It is a separate module so that sensors without multipath do not compile the ray tracing.
 """
 
 from typing import Any
@@ -9,7 +10,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.images.camera_effects import shot_key
-from synpick_warp.kernels.render.images.depth_sensor import axial_noise, lattice_normals, measured_pixel, quantize_depth
+from synpick_warp.kernels.render.images.depth_sensor import measured_pixel, read_out
 from synpick_warp.kernels.render.images.layers import LayerScene
 from synpick_warp.kernels.render.lighting.brdf import Brdf, evaluate_brdf, specular_albedo
 from synpick_warp.kernels.render.lighting.color import luminance
@@ -17,7 +18,7 @@ from synpick_warp.kernels.render.lighting.finish import FinishedBrdf
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene, make_vertex
 from synpick_warp.kernels.render.visibility.bvh_rays import is_blocked, trace_ray
 from synpick_warp.kernels.render.visibility.camera import camera_ray, hit_position, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, AnyShot, read_hit
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
@@ -26,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def returned_light(scene: AnyScene, vertex: Any, projector: wp.vec3) -> float:
-    """Radiance, as luminance, that a surface returns of a point light of unit intensity: BRDF · cosine / distance²; 0 from behind."""
+    """Luminance that a surface reflects of a point light of unit intensity: BRDF · cosine / distance²; 0 for a light behind it."""
     away = projector - vertex.origin
     direction = wp.normalize(away)
     if wp.dot(vertex.face_normal, direction) <= 0.0:
@@ -37,21 +38,23 @@ def returned_light(scene: AnyScene, vertex: Any, projector: wp.vec3) -> float:
 
 @wp.func
 def mirror_albedo(brdf: Brdf) -> float:
-    """Directional albedo of specular reflection, as luminance."""
+    """Directional albedo of the specular lobe, as luminance."""
     return luminance(specular_albedo(brdf))
 
 
 @wp.func
 def mirror_albedo(brdf: FinishedBrdf) -> float:  # noqa: F811
-    """The same of coat and base."""
+    """Directional albedo of clear coat and specular lobe, as luminance."""
     return wp.lerp(1.0, luminance(specular_albedo(brdf)), brdf.passing)
 
 
 @wp.func
 def mirrored_light(scene: AnyScene, shot: AnyShot, view: int, vertex: Any, projector: wp.vec3, width: float) -> wp.vec2:
-    """Indirect light of a pixel, by one mirror ray from its surface p to a second one, q: its radiance E L, and the extra length of its
-    path, (|cp| + |pq| + |qc|) / 2 - |cp| [m]; zero: none. E: specular albedo of p, whose whole lobe is taken to meet q: too much for
-    rough metal. L: what q returns to p of a light at the projector c, if nothing is between them. `width`: the pixel's footprint [m]."""
+    """Indirect light of a pixel, found by one mirror ray from its surface p to a second surface q.
+
+    Returns its radiance E L and the extra path length (|cp| + |pq| + |qc|) / 2 - |cp| [m], or zeros. E is the specular albedo of p; the
+    whole lobe is assumed to hit q, which overestimates rough metal. L is the radiance from q to p, lit by the projector c if nothing
+    occludes it. `width`: footprint of the pixel [m]."""
     none, instances, mirror = wp.vec2(0.0, 0.0), shot.views.instances, vertex.brdf
     direction = 2.0 * wp.dot(mirror.normal, mirror.outgoing) * mirror.normal - mirror.outgoing
     if wp.dot(direction, vertex.face_normal) <= 0.0:
@@ -80,13 +83,13 @@ def add_multipath_kernel(
     # Out:
     image_inout: wp.array3d[wp.uint16],  # (view, row, column)
 ):
-    """Two-path multipath interference: lengthen measured range by w times the indirect path's extra length, w = s L_i / (L_d + s L_i).
+    """Two-path multipath interference: add w times the extra length of the indirect path to the range, with w = s L_i / (L_d + s L_i).
 
-    This is the phase of both returns (Freedman et al., ECCV 2014) where the extra length is small beside the wavelength of modulation. L_d
-    and L_i: direct and indirect radiance of a point light at the camera, s: `share` of the indirect light that the sensor does not reject.
-    Where s L_i > L_d is a hole: codes are decoded wrongly there (Gupta et al., CVPR 2011). Noise and steps follow, as without. Not
-    modelled: light between two diffuse surfaces, and light that a mirror casts on one. Launched over view, pixel (tile order, from flat
-    index `first` on)."""
+    L_d and L_i are the direct and indirect radiance of a point light at the camera, s is `share`, the fraction of indirect light that the
+    sensor does not reject. This approximates the phase of both returns (Freedman et al., ECCV 2014) if the extra length is small compared
+    with the modulation wavelength. Pixels with s L_i > L_d are holes, as their codes are decoded wrongly (Gupta et al., CVPR 2011). Noise
+    and quantization are those of the sensor without multipath. Diffuse interreflection and caustics are not modelled. Launched over view,
+    pixel (tile order, starting at flat index `first`)."""
     grid, sensor, cameras = shot.grid, layer.sensor, shot.views.cameras
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or int(image_inout[view, row, column]) == 0:
@@ -96,19 +99,16 @@ def add_multipath_kernel(
     hit = read_hit(shot.gbuffer, view, at_row, at_column)
     ray = camera_ray(cameras, view, at_row, at_column, wp.vec2(0.0, 0.0))
     toward = wp.normalize(cameras.to_world[view] * ray)
-    focal, projector = cameras.intrinsics[view][0], wp.vec3(cameras.center[view])
-    start, width = hit_position(cameras, view, ray, hit.depth), hit.depth / focal
+    projector, start = wp.vec3(cameras.center[view]), hit_position(cameras, view, ray, hit.depth)
+    width = hit.depth / cameras.intrinsics[view][0]
     vertex = make_vertex(scene, shot, view, hit, start, -toward, width, 0.0, False)
     path = mirrored_light(scene, shot, view, vertex, projector, width)
     indirect = share * path[0]
     if indirect <= 0.0:
         return
     direct = returned_light(scene, vertex, projector)
-    counts = float(0.0)
-    if indirect <= direct:
-        bias = indirect / (direct + indirect) * path[1] / wp.length(ray)
-        noise = lattice_normals(key, grid, sensor.noise_width, row, column, 2)
-        sigma = axial_noise(sensor, hit.depth, wp.abs(wp.dot(vertex.face_normal, toward)))
-        noisy = hit.depth + bias + sigma * noise[0]
-        counts = wp.rint(sensor.counts_per_meter * quantize_depth(sensor, focal * sensor.baseline, noisy, noise[1]))
-    image_inout[view, row, column] = wp.uint16(wp.where(counts <= MAX_COUNTS, counts, 0.0))
+    if indirect > direct:
+        image_inout[view, row, column] = wp.uint16(0)
+        return
+    bias, cosine = indirect / (direct + indirect) * path[1] / wp.length(ray), wp.abs(wp.dot(vertex.face_normal, toward))
+    image_inout[view, row, column] = read_out(layer, shot, view, row, column, hit.depth, cosine, bias)
