@@ -256,8 +256,7 @@ class DepthSensor:
     )
     multipath: Fraction = setting(
         0.0,
-        "Fraction of light over a second, mirrored surface that is not rejected: metal corners are measured too deep (Freedman et al., "
-        "2014); holes where it exceeds direct light (layer depth_sensor).",
+        "Fraction of the light over a mirrored surface that is not rejected: depth bias (Freedman et al., 2014), or holes (depth_sensor).",
     )
     registration: Fraction = setting(
         0.0,
