@@ -1,6 +1,7 @@
 """Compilation ahead of launches: dry launches run nothing and name modules, which are compiled once, in threads; SM partitions of a GPU.
 Warm-up: it launches what a bake launches, writes caches only, and counts what was compiled."""
 
+import ast
 import dataclasses
 import shutil
 import subprocess
@@ -16,6 +17,8 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 import warp as wp
+from newton._src.geometry import inertia
+from warp._src import codegen
 
 from synpick_warp.cli.main import main
 from synpick_warp.configs.cell.cameras import CameraRow, Pose
@@ -230,6 +233,18 @@ def test_warp_finds_what_modules_of_others_use_alone():
     for module in (others, ours):
         wp.Kernel(draw, key="draw", module=module)
     assert (others.references, ours.references) == ({uniform.module}, set())
+
+
+def test_source_code_of_newtons_functions_is_read_when_it_is_needed():
+    """Known: source and syntax tree that Warp reads at definition. Parameters are known before the source is read."""
+    function = inertia.triangle_inertia.func
+    adjoint, read = codegen.Adjoint(function), codegen.Adjoint.extract_function_source(function)
+    assert list(adjoint.arg_types) == [each.label for each in adjoint.args] == ["v0", "v1", "v2"]
+    assert "tree" not in vars(adjoint)
+    assert (adjoint.source, adjoint.fun_lineno, adjoint.fun_name) == (*read[:2], "triangle_inertia")
+    assert adjoint.source_lines == read[0].splitlines()
+    assert ast.dump(adjoint.tree) == ast.dump(read[2])
+    assert not hasattr(adjoint, "branch")
 
 
 HOLDER = """

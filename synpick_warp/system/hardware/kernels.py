@@ -11,6 +11,7 @@ systems, and no reason to fail.
 import atexit
 import contextlib
 import fcntl
+import inspect
 import os
 import shutil
 import sys
@@ -24,7 +25,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import warp as wp
-from warp._src import context
+from warp._src import codegen, context
 
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.hardware.cores import count_cores
@@ -244,7 +245,36 @@ def _find_references(module: wp.Module, adjoint: Any, find: Callable[..., None] 
         find(module, adjoint)
 
 
+_SOURCE = ("source", "source_lines", "fun_lineno", "fun_name", "tree", "_shared_source")
+"""Attributes of `warp.codegen.Adjoint`, which represents a function, that depend on its parsed source code."""
+
+
+def _make_adjoint(adjoint: Any, func: Any, *given: Any, make: Callable[..., None] = codegen.Adjoint.__init__, **options: Any) -> None:
+    """Initialize an adjoint; functions of Newton are parsed lazily, when their module is hashed or compiled (`_read_source`).
+
+    A bake uses a fifth of Newton's 1,500 functions; parsing all of them takes 3 of 10 s of CPU time of its imports. Functions with
+    `wp.static` expressions are parsed at once, as these are evaluated at definition."""
+    lazy = (func.__module__ or "").startswith("newton.") and "static" not in inspect.unwrap(func).__code__.co_names
+    lazy = lazy and not (options.get("source") or options.get("transformers"))
+    make(adjoint, func, *given, **options | ({"source": "def stub(): ..."} if lazy else {}))
+    for name in _SOURCE if lazy else ():
+        delattr(adjoint, name)
+
+
+def _read_source(adjoint: Any, name: str) -> Any:
+    """Parse the source code of an adjoint from `_make_adjoint` at the first access (`__getattr__`); adjoints of the same code share it."""
+    if name not in _SOURCE:
+        raise AttributeError(f"an adjoint has no {name}")
+    code = inspect.unwrap(adjoint.func).__code__
+    shared = codegen._shared_source_for_code(code) or codegen._SharedFunctionSource(*adjoint.extract_function_source(adjoint.func))
+    codegen._store_shared_source(code, shared)
+    source, tree = shared.source, shared.tree
+    vars(adjoint).update(zip(_SOURCE, (source, source.splitlines(), shared.fun_lineno, tree.body[0].name, tree, shared), strict=True))
+    return vars(adjoint)[name]
+
+
 wp.Module._find_references = _find_references  # type: ignore[method-assign]
+codegen.Adjoint.__init__, codegen.Adjoint.__getattr__ = _make_adjoint, _read_source  # type: ignore[method-assign]
 
 
 @contextlib.contextmanager
