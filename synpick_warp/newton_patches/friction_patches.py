@@ -1,5 +1,6 @@
 """Friction patches of SolverSteel, with contacts sorted by ranks within worlds instead of a radix sort of eight passes."""
 
+import contextlib
 import functools
 import threading
 from collections.abc import Callable
@@ -10,9 +11,13 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.newton_patches.friction_patches import sort_contacts_kernel
+from synpick_warp.newton_patches.narrow_phase import small_blocks
 
 BLOCK = 256
 """Threads that sort the contacts of a world."""
+FEW_WORLDS, GROWTH_BLOCK = 64, 4
+"""Number of worlds up to which the patches are grown in blocks of so many threads. The contacts of a pair of bodies are the work of one
+thread, for which the other threads of its warp wait."""
 
 
 def sort_by_worlds(patches: Any, model: newton.Model) -> None:
@@ -42,7 +47,8 @@ def _build(
 
     _thread.sort = sort if contacts.contact_matching else None
     try:
-        build(model, state, contacts, **options)
+        with small_blocks(GROWTH_BLOCK) if worlds <= FEW_WORLDS else contextlib.nullcontext():
+            build(model, state, contacts, **options)
     finally:
         _thread.sort = None
 

@@ -12,13 +12,14 @@ import newton
 import warp as wp
 from newton._src.geometry import inertia
 from newton._src.geometry import narrow_phase as narrow
+from newton._src.geometry import support_function
 from newton._src.geometry.contact_match import ContactMatcher
 from newton._src.sim import collide
 from newton._src.sim import model as newton_model
 from newton._src.solvers.steel import solver_steel  # noqa: F401  (Newton imports it late, and its modules are split below.)
 from warp._src import context
 
-from synpick_warp.kernels.newton_patches import contact_matching, key_ranks
+from synpick_warp.kernels.newton_patches import contact_matching, hull_support, key_ranks
 from synpick_warp.kernels.newton_patches.solver_iterations import WARP
 from synpick_warp.system.hardware.kernels import ModuleBuild, build_of, split_modules
 
@@ -31,6 +32,7 @@ for _type in (bool, float, int, wp.uint64, wp.vec2i, wp.vec3, wp.vec3i, wp.vec4i
 # On a GPU, Newton tests convex shapes in one kernel, or in four where the pairs of all worlds together exceed a threshold. They round
 # differently: an episode of few objects would depend on the number of worlds.
 collide._SPLIT_GJK_MPR_LEAN_PAIR_COUNT_THRESHOLD = collide._SPLIT_GJK_MPR_FULL_PAIR_COUNT_THRESHOLD = 0
+support_function._support_map_convex_mesh_exhaustive = hull_support.map_support
 BLOCK, BLOCKS, WORLD_BLOCKS = 32, 8, 2
 """Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or 2 for each world, whichever is more. Newton has four
 warps a block (one warp, if a hull has 256 or more vertices), 4 blocks a multiprocessor. A thread tests a pair of shapes for as long as it
@@ -67,13 +69,13 @@ def resize_blocks(pipeline: newton.CollisionPipeline) -> None:
 
 
 @contextlib.contextmanager
-def small_blocks() -> Iterator[None]:
-    """Have launches of this thread that leave the block size to Warp use blocks of `SMALL_BLOCK` threads on a GPU instead of 256.
+def small_blocks(threads: int = SMALL_BLOCK) -> Iterator[None]:
+    """Have launches of this thread that leave the block size to Warp use blocks of `threads` threads on a GPU instead of 256.
 
     A launch over the bodies of 48 worlds has 1,300 threads, with 256 a block on 6 of 132 multiprocessors, where they wait for memory of
     which each thread reads its own cache lines.
     """
-    before, _thread.block = getattr(_thread, "block", 0), SMALL_BLOCK
+    before, _thread.block = getattr(_thread, "block", 0), threads
     try:
         yield
     finally:
@@ -111,6 +113,23 @@ def sort_pairs(keys: wp.array, values: wp.array, count: int, begin_bit: int = 0,
 
 _radix_sort_pairs = wp.utils.radix_sort_pairs
 wp.utils.radix_sort_pairs = sort_pairs
+
+
+def spread_pairs(kernel: wp.Kernel) -> wp.Kernel:
+    """Kernel of GJK or of its refinement whose few pairs of shapes are tested by one thread of each warp, and not by all of the first warps.
+
+    The threads of a warp test different pairs, and wait for each other's memory and branches."""
+    source, spread = kernel.adj.source, f"first = tid % {BLOCK} * (total_num_threads // {BLOCK}) + tid // {BLOCK}\n"
+    return wp.Kernel(kernel.func, kernel.key, kernel.module, kernel.options, source=source.replace("first = tid\n", spread))
+
+
+def _create_split_kernels(*args: Any, create: Any = narrow.create_narrow_phase_kernels_gjk_mpr_split, **options: Any) -> tuple[Any, ...]:
+    """Kernels of MPR, GJK, its refinement and manifolds, in place of Newton's, with the same arguments; the pairs of GJK are spread."""
+    mpr, gjk, refine, manifold = create(*args, **options)
+    return mpr, spread_pairs(gjk), spread_pairs(refine), manifold
+
+
+narrow.create_narrow_phase_kernels_gjk_mpr_split = _create_split_kernels
 
 
 def slow_builds(device: wp.Device) -> list[ModuleBuild]:
