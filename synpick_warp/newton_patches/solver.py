@@ -1,10 +1,11 @@
 """Kernel fusion for Newton's SolverSteel: one kernel for all iterations of a substep instead of ten kernels per iteration."""
 
+import contextlib
 import ctypes
 import inspect
 import sys
-from collections.abc import Iterable
-from functools import cache, cached_property
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache, cached_property, partial
 from typing import Any
 
 import newton
@@ -58,6 +59,58 @@ class FusedSteel(newton.solvers.SolverSteel):
             clear_by_kernels(self.model.device)
             if self._friction_anchors_enabled:
                 sort_by_worlds(self._friction_patches, self.model)
+                self._friction_patches.build = partial(self._build_patches, self._friction_patches.build)
+
+    def _stage1_joint_tau(self, *args: Any) -> None:
+        """Compute joint torques, the first of the terms that friction patches do not need; arguments as in SolverSteel."""
+        self._kinematics_ready = self._record()
+        super()._stage1_joint_tau(*args)
+
+    def _build_patches(self, build: Callable[..., None], *args: Any, **options: Any) -> None:
+        """Build the friction patches beside the terms without contacts; arguments of `build` as in Newton."""
+        with self._branch(self._kinematics_ready):
+            build(*args, **options)
+
+    def _mf_pgs_setup(self, *args: Any) -> None:
+        """Compute the free bodies' inverse inertias and rows, the last that responses to impulses need; arguments as in SolverSteel."""
+        super()._mf_pgs_setup(*args)
+        self._inertias_ready = self._record()
+
+    def _propagation_setup(self, *args: Any) -> None:
+        """Compute responses to contact impulses beside the warm start of the other rows; arguments as in SolverSteel."""
+        self._velocities_ready = self._record()
+        with self._branch(self._inertias_ready):
+            super()._propagation_setup(*args)
+
+    def _propagation_refresh_twists(self, *, force: bool) -> None:
+        """Compute the twists of bodies from joint velocities; arguments as in SolverSteel."""
+        if force and self._velocities_ready is not None:
+            wp.get_stream(self.model.device).wait_event(self._velocities_ready)
+        super()._propagation_refresh_twists(force=force)
+
+    _inertias_ready: wp.Event | None = None
+    _velocities_ready: wp.Event | None = None
+
+    def _record(self) -> wp.Event | None:
+        """Event of all launches of this substep so far, on a GPU."""
+        return wp.get_stream(self.model.device).record_event() if self.model.device.is_cuda else None
+
+    @contextlib.contextmanager
+    def _branch(self, start: wp.Event | None) -> Iterator[None]:
+        """Branch of a substep's graph: launches within wait for `start` only, and those after it for all of them; None: no branch."""
+        if start is None:
+            yield
+            return
+        main = wp.get_stream(self.model.device)
+        self._side.wait_event(start)
+        with wp.ScopedStream(self._side, sync_enter=False):
+            yield
+        main.wait_event(self._side.record_event())
+
+    @cached_property
+    def _side(self) -> wp.Stream:
+        """Stream of branches."""
+        return wp.Stream(self.model.device)
 
     def _launch_propagation_solve(
         self,
