@@ -30,6 +30,8 @@ LANE_COLUMNS = wp.constant(8)
 """Interleaved order: threads of a warp in one row of coarse pixels."""
 VIEW_BLOCK = 32
 """Block size of kernels with a thread a view: small blocks spread few views over many multiprocessors."""
+CONTOUR_BLOCK = 4
+"""Block size of border following, whose threads wait for the longest border of their warp and for memory that they do not share."""
 JPEG_THREADS = 128
 """Threads per CUDA block in all kernels of the JPEG encoder: one size, because each size compiles a module again. The DCT uses 96
 registers a thread: a multiprocessor holds five CUDA blocks of 128 threads, or two of 256 (from ptxas for sm_90, not timed)."""

@@ -116,17 +116,19 @@ wp.utils.radix_sort_pairs = sort_pairs
 
 
 def spread_pairs(kernel: wp.Kernel) -> wp.Kernel:
-    """Kernel of GJK or of its refinement whose few pairs of shapes are tested by one thread of each warp, and not by all of the first warps.
+    """Kernel of GJK, its refinement or manifolds whose few pairs of shapes are tested by one thread of each warp, not all of the first warps.
 
     The threads of a warp test different pairs, and wait for each other's memory and branches."""
-    source, spread = kernel.adj.source, f"first = tid % {BLOCK} * (total_num_threads // {BLOCK}) + tid // {BLOCK}\n"
-    return wp.Kernel(kernel.func, kernel.key, kernel.module, kernel.options, source=source.replace("first = tid\n", spread))
+    source, thread = kernel.adj.source, f"tid % {BLOCK} * (total_num_threads // {BLOCK}) + tid // {BLOCK}"
+    for first in ("first = tid\n", "range(tid, num_work_items"):
+        source = source.replace(first, first.replace("tid", thread))
+    return wp.Kernel(kernel.func, kernel.key, kernel.module, kernel.options, source=source)
 
 
 def _create_split_kernels(*args: Any, create: Any = narrow.create_narrow_phase_kernels_gjk_mpr_split, **options: Any) -> tuple[Any, ...]:
-    """Kernels of MPR, GJK, its refinement and manifolds, in place of Newton's, with the same arguments; the pairs of GJK are spread."""
-    mpr, gjk, refine, manifold = create(*args, **options)
-    return mpr, spread_pairs(gjk), spread_pairs(refine), manifold
+    """Kernels of MPR, GJK, its refinement and manifolds, in place of Newton's, with the same arguments; all but MPR's spread their pairs."""
+    mpr, *kernels = create(*args, **options)
+    return mpr, *map(spread_pairs, kernels)
 
 
 narrow.create_narrow_phase_kernels_gjk_mpr_split = _create_split_kernels

@@ -23,7 +23,7 @@ from synpick_warp.kernels.perception.flat_points import choose_flat_points_kerne
 from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_normal_kernel
 from synpick_warp.kernels.perception.target import choose_target_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.kernels.tuning import VIEW_BLOCK
+from synpick_warp.kernels.tuning import CONTOUR_BLOCK, VIEW_BLOCK
 from synpick_warp.stages.arrays import allocate, allocate_struct, array_group, bundle, count_words, struct_arrays
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData
@@ -257,10 +257,10 @@ class Segmenter:
         launch(components.find_largest_kernel, (views, self.height * self.width), *sources)
         launch(components.unpack_largest_kernel, instances, *sources, **objects)
         launch_images(distance_transform.mark_patches_kernel, self.pixels, *sources)
-        launch(distance_transform.measure_columns_kernel, (views, self.width), *sources)
+        launch(distance_transform.measure_columns_kernel, (views, self.width), *sources, block_dim=VIEW_BLOCK)
         launch_images(distance_transform.measure_rows_kernel, self.pixels, *sources)
         launch(grasp_points.measure_patches_kernel, strips, *sources)
-        launch(contours.trace_contours_kernel, instances, *sources)
+        launch(contours.trace_contours_kernel, instances, *sources, block_dim=CONTOUR_BLOCK)
         cameras = {"intrinsics": images.scene.cameras.intrinsics}
         launch(grasp_points.measure_points_kernel, instances, *sources, **cameras, **objects)
         launch(grasp_points.choose_grasp_points_kernel, instances, *sources, hit_depth=images.gbuffer.depth, **objects)
