@@ -21,6 +21,7 @@ from warp._src import context
 
 from synpick_warp.kernels.newton_patches import contact_matching, hull_support, key_ranks
 from synpick_warp.kernels.newton_patches.solver_iterations import WARP
+from synpick_warp.system.hardware.device import HIGH_PRIORITY
 from synpick_warp.system.hardware.kernels import ModuleBuild, build_of, split_modules
 
 # Of the kernels in these modules of Newton, a bake launches a fifth.
@@ -60,12 +61,13 @@ SHIPPED = Path(__file__).with_name("narrow_phase.zip")
 
 
 def resize_blocks(pipeline: newton.CollisionPipeline) -> None:
-    """Set the block size and number of threads of Newton's narrow phase, on a GPU."""
+    """Set the block size, number of threads and stream of Newton's narrow phase, on a GPU."""
     model = pipeline.model
     if model.device.is_cuda:
         blocks = max(BLOCKS * model.device.sm_count, WORLD_BLOCKS * model.world_count)
         pipeline.narrow_phase.split_convex_block_dim = BLOCK
         pipeline.narrow_phase.split_convex_total_num_threads = BLOCK * blocks
+        pipeline.narrow_phase._split_refine_stream = wp.Stream(model.device, priority=HIGH_PRIORITY)
 
 
 @contextlib.contextmanager

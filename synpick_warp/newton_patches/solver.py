@@ -15,6 +15,7 @@ import warp as wp
 from synpick_warp.kernels.newton_patches import contact_rows, contact_sweep, solver_iterations, warm_start, world_order
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.friction_patches import sort_by_worlds
+from synpick_warp.system.hardware.device import sibling_stream
 
 RESIDENT_WARPS = 10
 """Warps of the iterations that run on a multiprocessor at the same time: 65,536 registers, up to 200 per thread. If more worlds are
@@ -54,6 +55,7 @@ class FusedSteel(newton.solvers.SolverSteel):
         """Prepare a solver for a model; arguments as in SolverSteel."""
         share_patches()
         super().__init__(*args, **kwargs)
+        self._sides: dict[int, wp.Stream] = {}
         self._serial_kernel_block_dim = SERIAL_BLOCK
         if self.model.device.is_cuda:
             clear_by_kernels(self.model.device)
@@ -88,17 +90,18 @@ class FusedSteel(newton.solvers.SolverSteel):
             wp.get_stream(self.model.device).wait_event(self._velocities_ready)
         super()._propagation_refresh_twists(force=force)
 
+    _side: wp.Stream | None = None
     _inertias_ready: wp.Event | None = None
     _velocities_ready: wp.Event | None = None
 
     def _record(self) -> wp.Event | None:
-        """Event of all launches of this substep so far, on a GPU."""
-        return wp.get_stream(self.model.device).record_event() if self.model.device.is_cuda else None
+        """Event of all launches of this substep so far; None: no branch was opened."""
+        return None if self._side is None else wp.get_stream(self.model.device).record_event()
 
     @contextlib.contextmanager
     def _branch(self, start: wp.Event | None) -> Iterator[None]:
         """Branch of a substep's graph: launches within wait for `start` only, and those after it for all of them; None: no branch."""
-        if start is None:
+        if start is None or self._side is None:
             yield
             return
         main = wp.get_stream(self.model.device)
@@ -107,10 +110,11 @@ class FusedSteel(newton.solvers.SolverSteel):
             yield
         main.wait_event(self._side.record_event())
 
-    @cached_property
-    def _side(self) -> wp.Stream:
-        """Stream of branches."""
-        return wp.Stream(self.model.device)
+    def open_branch(self, stream: wp.Stream) -> None:
+        """Have branches of steps on a CUDA stream run beside it, on the same multiprocessors. Call it before steps on another stream."""
+        if stream.cuda_stream not in self._sides:
+            self._sides[stream.cuda_stream] = sibling_stream(stream)
+        self._side = self._sides[stream.cuda_stream]
 
     def _launch_propagation_solve(
         self,

@@ -7,10 +7,7 @@ from typing import Self
 import warp as wp
 
 from synpick_warp.errors import DeviceError
-from synpick_warp.system.hardware.device import SmPartition, count_reserved
-
-HIGH_PRIORITY = -1
-"""CUDA stream priority of physics: its 6,600 short kernels per tick depend on one another, and should not also wait for the renderer's."""
+from synpick_warp.system.hardware.device import HIGH_PRIORITY, SmPartition, count_reserved
 
 Streams = tuple[wp.Stream | None, wp.Stream | None, wp.Stream | None]
 """Streams (render, copy, solver), all None on a CPU. Render: None for the device's current stream. Copy: for encoding and for copies to the

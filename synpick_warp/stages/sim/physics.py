@@ -17,7 +17,7 @@ from synpick_warp.kernels.state import Contacts
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase
 from synpick_warp.newton_patches.narrow_phase import complete_matching, rank_contacts, resize_blocks, small_blocks
-from synpick_warp.newton_patches.solver import choose_solver
+from synpick_warp.newton_patches.solver import FusedSteel, choose_solver
 from synpick_warp.scenes import build
 from synpick_warp.stages.arrays import bundle
 from synpick_warp.stages.launch import launch
@@ -171,16 +171,23 @@ class Physics:
         periods = self.settings.steps_per_tick * self.settings.substeps // period
         eager = self._run_substeps(before_step, after_collide, watcher)
         if not self._graphs:
+            self._open_branch(None)
             yield from itertools.islice(eager, period)
             periods -= 1
         if stream not in self._graphs:
             if not may_capture(self.device):
                 yield from eager
                 return
+            self._open_branch(stream)
             self._graphs[stream] = self._capture(itertools.islice(self._run_substeps(before_step, after_collide, watcher, stream), period))
         for graph in self._graphs[stream] * periods:
             wp.capture_launch(graph)
             yield
+
+    def _open_branch(self, stream: wp.Stream | None) -> None:
+        """Have the solver use two streams on a GPU, of which one is `stream`, None: the current one."""
+        if self.device.is_cuda and isinstance(self.solver, FusedSteel):
+            self.solver.open_branch(stream or wp.get_stream(self.device))
 
     def _period(self, watcher: Watcher | None) -> int:
         """Period of the launches [substeps]: a step, or with a watcher, whose launches differ between steps, a tick."""

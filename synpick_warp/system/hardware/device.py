@@ -127,6 +127,8 @@ def _without_driver_warning() -> Iterator[None]:
                     print(line, file=sys.stderr)
 
 
+HIGH_PRIORITY = -1
+"""CUDA stream priority of physics: its 6,600 short kernels per tick depend on one another, and should not also wait for the renderer's."""
 _SM_RESOURCE = 1
 """CU_DEV_RESOURCE_TYPE_SM"""
 _DEFAULT_STREAM = 1
@@ -185,6 +187,18 @@ class SmPartition:
         result = function(*arguments)
         if result != 0:
             raise DeviceError(f"{self.device.alias}: {name} failed with CUDA error {result}")
+
+
+def sibling_stream(stream: wp.Stream) -> wp.Stream:
+    """Create a stream of high priority beside another one: on its SMs, if it belongs to an `SmPartition`, else on all."""
+    context, sibling, driver = ctypes.c_void_p(), ctypes.c_void_p(), _load_driver()
+    find = getattr(driver, "cuStreamGetGreenCtx", None)  # The driver has it if it has streams of green contexts.
+    if find is None or find(ctypes.c_void_p(stream.cuda_stream), ctypes.byref(context)) != 0 or not context.value:
+        return wp.Stream(stream.device, priority=HIGH_PRIORITY)
+    result = driver.cuGreenCtxStreamCreate(ctypes.byref(sibling), context, _NON_BLOCKING, HIGH_PRIORITY)
+    if result != 0:
+        raise DeviceError(f"{stream.device.alias}: cuGreenCtxStreamCreate failed with CUDA error {result}")
+    return wp.Stream(stream.device, cuda_stream=sibling.value)
 
 
 def count_reserved(device: wp.Device, fraction: float) -> int:
