@@ -10,9 +10,8 @@ from typing import Any
 
 import newton
 import warp as wp
-from newton._src.geometry import inertia
+from newton._src.geometry import inertia, support_function
 from newton._src.geometry import narrow_phase as narrow
-from newton._src.geometry import support_function
 from newton._src.geometry.contact_match import ContactMatcher
 from newton._src.sim import collide
 from newton._src.sim import model as newton_model
@@ -33,6 +32,7 @@ for _type in (bool, float, int, wp.uint64, wp.vec2i, wp.vec3, wp.vec3i, wp.vec4i
 # On a GPU, Newton tests convex shapes in one kernel, or in four where the pairs of all worlds together exceed a threshold. They round
 # differently: an episode of few objects would depend on the number of worlds.
 collide._SPLIT_GJK_MPR_LEAN_PAIR_COUNT_THRESHOLD = collide._SPLIT_GJK_MPR_FULL_PAIR_COUNT_THRESHOLD = 0
+# Hulls are tested for contacts by their vertices alone; functions of Newton's look this one up when they are compiled.
 support_function._support_map_convex_mesh_exhaustive = hull_support.map_support
 BLOCK, BLOCKS, WORLD_BLOCKS = 32, 8, 2
 """Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or 2 for each world, whichever is more. Newton has four
@@ -118,7 +118,7 @@ wp.utils.radix_sort_pairs = sort_pairs
 
 
 def spread_pairs(kernel: wp.Kernel) -> wp.Kernel:
-    """Kernel of GJK, its refinement or manifolds whose few pairs of shapes are tested by one thread of each warp, not all of the first warps.
+    """Kernel of GJK, its refinement or manifolds that gives few pairs of shapes to one thread of each warp, not to all of the first warps.
 
     The threads of a warp test different pairs, and wait for each other's memory and branches."""
     source, thread = kernel.adj.source, f"tid % {BLOCK} * (total_num_threads // {BLOCK}) + tid // {BLOCK}"
@@ -128,7 +128,7 @@ def spread_pairs(kernel: wp.Kernel) -> wp.Kernel:
 
 
 def _create_split_kernels(*args: Any, create: Any = narrow.create_narrow_phase_kernels_gjk_mpr_split, **options: Any) -> tuple[Any, ...]:
-    """Kernels of MPR, GJK, its refinement and manifolds, in place of Newton's, with the same arguments; all but MPR's spread their pairs."""
+    """Kernels of MPR, GJK, its refinement and manifolds, in place of Newton's, with its arguments; all but that of MPR spread their pairs."""
     mpr, *kernels = create(*args, **options)
     return mpr, *map(spread_pairs, kernels)
 

@@ -12,6 +12,7 @@ from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.kernels.newton_patches import contact_matching as kernels
 from synpick_warp.kernels.newton_patches.friction import solve_friction
 from synpick_warp.kernels.newton_patches.friction_patches import sort_contacts_kernel
+from synpick_warp.kernels.newton_patches.hull_support import find_farthest
 from synpick_warp.newton_patches.narrow_phase import MAX_DISTANCE, sort_pairs
 from synpick_warp.scenes.collision.hulls import hull_planes
 from synpick_warp.scenes.collision.simplification import simplify_hull
@@ -69,6 +70,23 @@ def test_contacts_sorted_by_ranks_are_in_the_order_of_a_stable_sort(device, coun
         sort_pairs(keys, indices, capacity, end_bit=63)
         np.testing.assert_array_equal(keys.numpy()[:capacity], np.sort(random[:capacity]))
         np.testing.assert_array_equal(indices.numpy()[:count], order)
+
+
+farthest = probe(find_farthest)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("count", [1, 3, 4, 5, 7, 8, 11, 12, 64, 67])
+def test_the_support_of_a_hull_is_its_first_farthest_vertex(device, count, first):
+    """Points of a grid, many of which are equally far in a direction along an axis; known: NumPy's first maximum. Points behind another one
+    in memory are not aligned for wide loads."""
+    random = np.random.default_rng(count)
+    points = random.integers(-2, 3, (first + count, 3)).astype(np.float32)
+    vertices = wp.array(points, dtype=wp.vec3, device=device)[first:]
+    mesh = wp.Mesh(vertices, wp.zeros(3, dtype=int, device=device))
+    directions = np.concatenate((np.eye(3), -np.eye(3), random.integers(-2, 3, (20, 3)))).astype(np.float32)
+    packed = np.tile(np.array([mesh.id >> shift & 0x3FFFFF for shift in (0, 22, 44)], np.float32), (len(directions), 1))
+    np.testing.assert_array_equal(farthest(packed, directions, device=device), points[first:][np.argmax(directions @ points[first:].T, 1)])
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,9 @@
 """Support mapping of a convex hull: the vertex farthest in a direction, by a scan of all vertices with wide loads.
 
-Newton scans them with three loads of 4 bytes for each vertex. The threads of a warp test different pairs of shapes, so that each load touches
-as many cache lines as there are threads, and the loads are what GJK, MPR and manifolds wait for. Here six loads of 16 bytes bring
-eight vertices, and the eight dot products are compared as a tree. The result has the same bits: products are summed in the same order, and of
-vertices at the same distance the first counts.
+Newton scans them with three loads of 4 bytes for each vertex. The threads of a warp test different pairs of shapes, so a load touches as
+many cache lines as there are threads, and the loads are what GJK, MPR and manifolds wait for. Here six loads of 16 bytes bring eight
+vertices, and the eight dot products are compared as a tree. The vertex is the same: products are summed in the same order, and of vertices
+at the same distance the first counts.
 """
 
 from typing import Any
