@@ -1,5 +1,7 @@
 """Contacts: matching, in which one without a partner takes the nearest one left; manifolds; friction; and the order of patches."""
 
+import re
+
 import newton
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from synpick_warp.kernels.newton_patches import contact_matching as kernels
 from synpick_warp.kernels.newton_patches.friction import solve_friction
 from synpick_warp.kernels.newton_patches.friction_patches import sort_contacts_kernel
 from synpick_warp.kernels.newton_patches.hull_support import find_farthest
-from synpick_warp.newton_patches.narrow_phase import MAX_DISTANCE, sort_pairs
+from synpick_warp.newton_patches.narrow_phase import BLOCK, MAX_DISTANCE, _narrow_kernels, sort_pairs
 from synpick_warp.scenes.collision.hulls import hull_planes
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece
@@ -87,6 +89,18 @@ def test_the_support_of_a_hull_is_its_first_farthest_vertex(device, count, first
     directions = np.concatenate((np.eye(3), -np.eye(3), random.integers(-2, 3, (20, 3)))).astype(np.float32)
     packed = np.tile(np.array([mesh.id >> shift & 0x3FFFFF for shift in (0, 22, 44)], np.float32), (len(directions), 1))
     np.testing.assert_array_equal(farthest(packed, directions, device=device), points[first:][np.argmax(directions @ points[first:].T, 1)])
+
+
+def test_few_pairs_of_shapes_are_tested_by_a_thread_of_each_warp():
+    """Kernels of GJK, its refinement and manifolds, whose source code is Newton's but for the first pair of a thread."""
+    threads, warps, found = 4096, 4096 // BLOCK, 0
+    for kernel, _ in _narrow_kernels(True):
+        for first in re.findall(r"(?:first = |range\()(tid % [^,\n]*)", kernel.adj.source):
+            pairs = eval(first, {"tid": np.arange(threads), "total_num_threads": threads})
+            np.testing.assert_array_equal(np.sort(pairs), np.arange(threads))
+            np.testing.assert_array_equal(np.argsort(pairs)[:warps] // BLOCK, np.arange(warps))
+            found += 1
+    assert found == 3
 
 
 @pytest.mark.parametrize(
