@@ -128,7 +128,7 @@ def spread_pairs(kernel: wp.Kernel) -> wp.Kernel:
 
 
 def _create_split_kernels(*args: Any, create: Any = narrow.create_narrow_phase_kernels_gjk_mpr_split, **options: Any) -> tuple[Any, ...]:
-    """Kernels of MPR, GJK, its refinement and manifolds, with the arguments of Newton's function; all but that of MPR spread their pairs."""
+    """Kernels of MPR, GJK, its refinement and manifolds, with the arguments of Newton's function; all but MPR spread their pairs."""
     mpr, *kernels = create(*args, **options)
     return mpr, *map(spread_pairs, kernels)
 
