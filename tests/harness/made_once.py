@@ -7,8 +7,10 @@ import pickle
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
+import warp as wp
 from newton._src.geometry import narrow_phase
 
 from synpick_warp.apps.conversion import foreign, run
@@ -18,6 +20,7 @@ from synpick_warp.cloud import run as cloud_run
 from synpick_warp.dataset.commit import merge, writing
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory import pipeline
+from synpick_warp.kernels.render.visibility.variants import VARIANTS
 from synpick_warp.scenes.collision import simplification
 from synpick_warp.stages.render import light_tables, scene
 from synpick_warp.system.processes import isolation
@@ -44,9 +47,21 @@ def remembered(make: Callable[..., object], most: int = MOST_MAPS) -> Callable[.
     return remember
 
 
+def permuted(template: wp.Kernel, types: dict[str, Any], overload: Callable[..., wp.Kernel] = wp.overload) -> wp.Kernel:
+    """`wp.overload`, with a module for each set of structs that are not the default: in the module of its template, a permutation is
+    compiled again with those of all tests that ran before in this process, in every order of tests."""
+    special = {kind.key for name, kind in types.items() if name in VARIANTS and kind is not VARIANTS[name][0]}
+    if special:
+        module = wp.get_module(".".join([template.module.name, *sorted(special)]))
+        module.options = dict(template.module.options)
+        template = wp.Kernel(template.func, template.key, module, template.options)
+    return overload(template, types)
+
+
 @contextmanager
 def made_once() -> Iterator[None]:
     """Cache environment tables, convex hulls, parsed TOML and Newton's narrow-phase kernels for the life of a process; forks inherit them.
+    Permutations of kernels are compiled apart (`permuted`).
 
     Files are not flushed to the disk, as no test simulates a power failure here: what a killed process wrote remains.
     """
@@ -56,6 +71,7 @@ def made_once() -> Iterator[None]:
         patch.setattr(simplification, "hull_piece", remembered(simplification.hull_piece, MOST_HULLS))
         for name in KERNELS:
             patch.setattr(narrow_phase, name, functools.cache(getattr(narrow_phase, name)))
+        patch.setattr(wp, "overload", permuted)
         read = functools.lru_cache(maxsize=MOST_MAPS)(lambda text, loads=tomllib.loads: pickle.dumps(loads(text)))
         patch.setattr(tomllib, "loads", lambda text: pickle.loads(read(text)))
         patch.setattr(os, "fsync", lambda handle: None)
