@@ -28,6 +28,7 @@ from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.testing.exporters import digests
 from tests.builders import PICKED, STIRRING, assignments, bake_boxes, boxes, failing_after, once
+from tests.worlds.cells import check_same
 from tests.worlds.small_worlds import BRIEF, QUICK, catalog, settings
 
 EPISODES, CAMERAS = 3, 3
@@ -89,23 +90,17 @@ def test_the_same_settings_give_the_same_bytes_with_a_profile_too(baked, tmp_pat
     assert recorder.times["simulate",].host < recorder.wall
 
 
-@pytest.mark.parametrize(("worlds", "lead"), [(1, 0), pytest.param(2, 5, marks=pytest.mark.slow), (4, 5)])
-def test_neither_the_number_of_worlds_nor_the_lead_of_physics_changes_a_scene(baked, tmp_path, monkeypatch, worlds, lead):
+@pytest.mark.parametrize(
+    ("worlds", "lead", "writers", "batch"), [(1, 0, 1, CAMERAS), pytest.param(2, 5, 1, CAMERAS, marks=pytest.mark.slow), (4, 5, 2, 4)]
+)
+def test_neither_worlds_nor_the_lead_of_physics_nor_writers_change_a_file(baked, tmp_path, monkeypatch, worlds, lead, writers, batch):
     """Two worlds are fewer than the episodes, so physics leads only once a world is idle; with four it leads from the start."""
     leads, may_begin = set(), TickLoop._may_begin
     monkeypatch.setattr(ticks, "queue_lead", lambda *_: lead)
     monkeypatch.setattr(TickLoop, "_may_begin", lambda loop: leads.add(loop._enqueued - loop._taken) or may_begin(loop))
-    other = Baked(tmp_path / "other", TINY | {"bake.worlds": worlds})
+    other = Baked(tmp_path / "other", TINY | {"bake.worlds": worlds, "bake.writers": writers, "render.views_per_batch": batch})
     assert max(leads) == lead or other.config.bake.device != "cpu"  # A GPU may not get so far ahead.
-    split = baked.config.bop.split
-    assert other.files(split) == baked.files(split)
-    assert {name for name, _ in other.files().items() ^ baked.files().items()} <= {"config.toml"}
-
-
-def test_neither_writers_nor_batches_change_a_file(baked, tmp_path):
-    other = Baked(tmp_path / "other", TINY | {"bake.writers": 2, "render.views_per_batch": 4})
-    split = baked.config.bop.split
-    assert other.files(split) == baked.files(split)
+    check_same(other.out, baked.out)
 
 
 def test_another_seed_gives_other_scenes(baked, tmp_path):
@@ -219,7 +214,7 @@ def test_what_was_picked_is_in_the_truth_until_then(picked):
 
 def test_attempts_are_the_same_in_any_number_of_worlds(picked, tmp_path):
     other = Baked(tmp_path / "other", PICKED | {"bake.worlds": 1, "perception.views": 1})
-    assert {name for name, _ in other.files().items() ^ picked.files().items()} == {"config.toml"}
+    check_same(other.out, picked.out)
 
 
 FOUR_CUPS = PICKED | {
@@ -247,7 +242,7 @@ def four_cups(tmp_path_factory) -> Baked:
 def test_four_cups_pick_the_same_in_any_number_of_worlds(four_cups, tmp_path):
     with boxes(large_boxes):
         other = Baked(tmp_path / "other", FOUR_CUPS | {"bake.worlds": 2})
-    assert {name for name, _ in other.files().items() ^ four_cups.files().items()} == {"config.toml"}
+    check_same(other.out, four_cups.out)
     assert max(len(attempt["sealed"]) for attempt in records(four_cups, "attempts")) > 1
 
 

@@ -1,6 +1,7 @@
 """Distractors, which occlude others, but have no labels and are no targets; and all that can be randomized at once: the same bytes in any
 number of worlds."""
 
+import functools
 import json
 from dataclasses import fields, replace
 from pathlib import Path
@@ -269,12 +270,15 @@ def test_inputs_without_distractors_have_the_digest_that_they_had():
 # ---- settings ----
 
 
+made_solids = functools.cache(solids)
+
+
 @pytest.mark.parametrize(("own", "surfaces"), [(False, 0), (True, 1)])
 def test_distractors_of_no_folder_are_solids(tmp_path, own, surfaces):
     """Household objects look like those of labelled classes, such as the banana of the YCB models."""
     models = str(put(tmp_path / "own" / "cube.stl", box(0.05, 0.05, 0.05, kind="stl")).parent) if own else ""
     loaded = load_catalog(load_config("smoke", {"bake.models": models, "randomize.distractors": 2, "randomize.surfaces": surfaces}))
-    assert [body.name for body in loaded.distractors] == [raw.name for raw in solids(surfaces > 0)]
+    assert [body.name for body in loaded.distractors] == [raw.name for raw in made_solids(surfaces > 0)]
     assert loaded.object_ids.tolist()[len(loaded) :] == [-2 - index for index in range(len(loaded.distractors))]
 
 
@@ -301,7 +305,7 @@ def test_distractors_that_look_like_a_labelled_object_are_left_out(tmp_path):
 
 @pytest.mark.parametrize(("textured", "largest"), [(False, 0.2), (True, 0.32)])
 def test_solids_are_closed_convex_and_as_large_as_other_parts(textured, largest):
-    made = solids(textured)
+    made = made_solids(textured)
     assert len({body.name for body in made}) == len(made)
     for body in made:
         assert (body.material.texture is not None) == textured

@@ -452,14 +452,6 @@ def test_webdatasets_pipeline_gives_what_was_written(shard):
         assert sample["camera.json"]["depth_scale"] == 0.1
 
 
-@LEFT_OPEN
-def test_webdatasets_own_decoder_clips_depth_to_0_and_255(shard):
-    """The reason why there is a decoder; if this fails, webdataset has learnt it."""
-    depth = read(shard, "l8")[0]["depth.png"]
-    assert depth.dtype == np.uint8
-    assert set(np.unique(depth)) <= {0, 255}
-
-
 def test_views_without_instances_have_no_masks_and_other_entries_are_left_to_webdataset():
     assert decode_view(".mask.json", b"{}").shape == (0, 0, 0)
     assert [decode_view(key, b"{}") for key in (".camera.json", ".txt", ".__key__")] == [None] * 3

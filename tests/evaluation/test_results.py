@@ -296,17 +296,6 @@ def test_truth_has_a_row_per_instance_image_and_camera(folder, truth):
     assert set(truth.poses.score) == {1.0}
 
 
-def test_speed_is_from_the_frame_before_or_else_from_the_next():
-    image = np.array([0, 1, 2, 4, 0])
-    count = len(image)
-    places = np.zeros((count, 3))
-    places[:, 0] = [0.0, 0.1, 0.4, 2.0, 7.0]
-    zero, one, instance = np.zeros(count, np.int64), np.ones(count), np.array([0, 0, 0, 0, 1])
-    poses = PoseTable(zero, image, zero, np.tile(np.eye(3), (count, 1, 1)), places, one, -one, instance)
-    assert instance_speeds(poses, 0.1) == pytest.approx([1.0, 1.0, 3.0, np.nan, np.nan], nan_ok=True)
-    assert len(instance_speeds(poses.select(np.zeros(count, bool)), 0.1)) == 0
-
-
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 25))
 @settings(max_examples=fuzz_examples(100))
 def test_speeds_are_those_of_each_row(seed, count):

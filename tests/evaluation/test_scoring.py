@@ -245,41 +245,6 @@ def table(keys: list[tuple[int, int, int]], scores: list[float] | None = None) -
     return poses.select(order)
 
 
-def test_estimates_meet_instances_of_the_same_image_and_object():
-    truth = table([(0, 0, 1), (0, 0, 1), (0, 0, 2), (0, 1, 1)])
-    estimates = table([(0, 0, 1), (0, 0, 2), (0, 0, 3), (0, 2, 1)])
-    pairs = make_pairs(truth, np.ones(4, bool), estimates)
-    assert list(zip(pairs.estimate, pairs.truth, strict=True)) == [(0, 0), (0, 1), (1, 2)]
-
-
-def test_only_the_best_estimates_count():
-    truth = table([(0, 0, 1), (0, 0, 1)])
-    estimates = table([(0, 0, 1)] * 4, [0.1, 0.9, 0.5, 0.9])
-    for top, expected in ((PER_INSTANCE, [1, 3]), (ALL, [1, 3, 2, 0]), (1, [1])):
-        pairs = make_pairs(truth, np.ones(2, bool), estimates, top)
-        assert pairs.estimate[::2].tolist() == expected
-    pairs = make_pairs(truth, np.array([False, True]), estimates)
-    assert (pairs.estimate.tolist(), pairs.truth.tolist()) == ([1], [1])
-
-
-def test_the_better_score_chooses_first_though_another_fits_better():
-    """An error at the threshold is no match."""
-    truth, estimates = table([(0, 0, 1), (0, 0, 1)]), table([(0, 0, 1)] * 2, [0.5, 0.9])
-    pairs = make_pairs(truth, np.ones(2, bool), estimates)
-    assert pairs.estimate.tolist() == [1, 1, 0, 0]
-    assert match(pairs, np.array([0.02, 0.03, 0.01, 0.2]), 0.1, 2).tolist() == [0, -1]
-    assert match(pairs, np.array([0.02, 0.03, 0.01, 0.04]), 0.1, 2).tolist() == [0, 3]
-    assert match(pairs, np.array([0.1, np.inf, np.inf, 0.1]), 0.1, 2).tolist() == [-1, -1]
-
-
-def test_no_estimates_and_no_targets():
-    some, none = table([(0, 0, 1)]), table([])
-    for truth, estimates, target in ((some, none, [True]), (none, some, []), (some, some, [False]), (none, none, [])):
-        pairs = make_pairs(truth, np.array(target, bool), estimates)
-        assert len(pairs.truth) == 0
-        assert match(pairs, np.empty(0), 0.1, len(truth)).tolist() == [-1] * len(truth)
-
-
 def test_many_hypotheses_take_as_many_rounds_as_instances():
     count = 20_000
     truth, estimates = table([(0, 0, 1), (0, 0, 1)]), table([(0, 0, 1)] * count, np.linspace(1.0, 0.0, count).tolist())

@@ -4,21 +4,16 @@ Occlusion votes along contours of synthetic images, and the graphs that follow f
 import networkx as nx
 import numpy as np
 import pytest
-import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.codes import MAX_INSTANCES, Mode
-from synpick_warp.kernels.perception.clutter_graph import edge_weight
 from synpick_warp.stages.arrays import count_words, unpack_words
-from tests.harness.environment import default_device
-from tests.harness.probe import probe
 from tests.twins import planning
 from tests.twins.planning import PlannerHarness, mosaic, paint, paint_shapes
 
 LEAST = planning.SETTINGS["min_votes"]
 EXACT = planning.SETTINGS["exact_cycle"]
-weigh = probe(edge_weight)
 Pairs = dict[tuple[int, int], float]
 
 
@@ -36,17 +31,6 @@ def graphs(device, votes: np.ndarray, **settings) -> list[tuple[nx.DiGraph, nx.D
         np.testing.assert_array_equal(paths, expected)
         found.append((whole, kept))
     return found
-
-
-def test_opposite_votes_below_the_least_do_not_count():
-    """Weights of the edge 1 → 0 by votes for and against it."""
-    found = [float(weigh(votes_of(*votes), 0, 0, 1, LEAST)) for votes in ((6, 4), (6, 5), (5, 6), (4, 0))]
-    assert found == [6.0, 1.0, 0.0, 0.0]
-
-
-def votes_of(votes: float, opposite: float) -> wp.array:
-    """Votes (1, 2, 2) of two instances."""
-    return wp.array([[[0.0, votes], [opposite, 0.0]]], dtype=float, device=default_device())
 
 
 def weight(whole: nx.DiGraph, kept: nx.DiGraph) -> float:
@@ -227,9 +211,6 @@ def harness_of(device, *pictures, instances: int = 5, **options) -> PlannerHarne
     return PlannerHarness(device, [ids for ids, _ in pictures], [depth for _, depth in pictures], instances, **options)
 
 
-# ---- votes ----
-
-
 @pytest.mark.parametrize(
     ("rectangles", "expected"),
     [
@@ -272,20 +253,6 @@ def test_objects_at_the_image_border(device):
     assert votes.sum() == votes[0, 1]
 
 
-def test_votes_for_neighbours_below_the_grasp_point_have_little_weight(device):
-    steep = paint_shapes(
-        [
-            (np.array([(20, 20), (59, 20), (59, 59), (20, 59)]), (0.002, 0.0, 1.9)),
-            (np.array([(60, 10), (100, 10), (100, 70), (60, 70)]), (0.0, 0.0, 2.0)),
-        ]
-    )
-    harness = harness_of(device, steep)
-    # At the border the lower object has a depth of at least 2.012; the grasp point, near column 40, 1.98.
-    for grasp_depth, weight in ((1.97, 0.1), (1.985, 1.0), (1.979, 0.1)):
-        harness.observation.depth.assign(np.full((1, 5), grasp_depth))
-        assert harness.votes()[0, 0, 1] == pytest.approx(40 * weight)
-
-
 # ---- reach ----
 
 
@@ -302,14 +269,6 @@ def test_points_vote_if_the_whole_neighbour_is_within_reach(device):
     expected = (np.hypot(np.maximum(columns - 5, 115 - columns), 8) <= 70).sum()
     assert expected == 29
     assert harness_of(device, picture, diagonal=reaching(70)).votes()[0, 0, 1] == expected
-
-
-def test_neighbour_longer_than_its_reach_gets_no_vote(device):
-    """From the middle of the bar its ends are 55 pixels away, 8 rows down."""
-    picture = paint([(5, 20, 115, 49, LOW), (5, 50, 115, 60, HIGH)])
-    farthest = np.hypot(55, 8)
-    assert harness_of(device, picture, diagonal=reaching(farthest * 1.001)).votes()[0, 0, 1] == 1
-    assert harness_of(device, picture, diagonal=reaching(farthest * 0.999)).votes()[0, 0, 1] == 0
 
 
 def test_small_neighbour_at_the_end_of_a_long_object_gets_votes(device):
@@ -448,26 +407,3 @@ def test_known_stacks(device, rectangles, above, chosen):
     for mode, target in zip((Mode.PICK, Mode.TARGET), chosen, strict=True):
         harness.worlds.state.mode.fill_(mode)
         assert harness.choose() == [target]
-
-
-def test_a_cycle_of_three_is_broken_at_its_weakest_edge(device):
-    """Each bar passes under the next; the borders have different lengths."""
-    size = {"height": 120, "width": 160}
-    ids, depth = np.full(tuple(size.values()), -1), np.full(tuple(size.values()), 2.5, np.float32)
-
-    def fill(i, left, top, right, bottom, z):
-        ids[top : bottom + 1, left : right + 1], depth[top : bottom + 1, left : right + 1] = i, z
-
-    # 1 over 0 along 40 pixels, 2 over 1 along 30, 0 over 2 along 20: each object has a high and a low part.
-    fill(0, 10, 10, 60, 49, 1.90)
-    fill(1, 61, 10, 100, 49, 1.88)
-    fill(1, 71, 50, 100, 60, 1.92)
-    fill(2, 71, 61, 100, 100, 1.90)
-    fill(2, 50, 81, 70, 100, 1.90)
-    fill(0, 10, 50, 20, 100, 1.86)
-    fill(0, 21, 81, 49, 100, 1.86)
-    harness = PlannerHarness(device, [ids], [depth], 3)
-    votes = harness.votes()[0]
-    assert votes[0, 1] > votes[1, 2] > votes[2, 0] >= 5
-    edges, _ = harness.graph()
-    np.testing.assert_array_equal(edges[0], [[False, True, False], [False, False, True], [False, False, False]])

@@ -79,6 +79,13 @@ class Builder:
         Image.fromarray(COLORS).save(file, "png")
         return self.with_(images=[{"bufferView": self.view(file.getvalue()), "mimeType": "image/png"}], textures=[{"source": 0}])
 
+    def beside(self, material: dict[str, Any], *scales: float) -> Builder:
+        """Add a second part of this material. `scales`: of both parts; none: 1."""
+        self.content["meshes"].append({"primitives": [{**self.primitive, "material": 1}]})
+        self.content["materials"].append(material)
+        nodes = [{"mesh": part, "scale": [scale] * 3} for part, scale in enumerate(scales or (1, 1))]
+        return self.with_(nodes=nodes, scenes=[{"nodes": [0, 1]}])
+
     def glb(self) -> bytes:
         text = json.dumps(self.content | {"buffers": [{"byteLength": len(self.binary)}]}).encode()
         return pack_glb(text + b" " * (-len(text) % 4), self.binary)
@@ -365,20 +372,13 @@ def test_what_transmission_leaves_out_is_said(tmp_path):
 
 def test_parts_keep_their_transmission(tmp_path):
     """An opaque part, such as a label, has the opacity that the clearest one lacks; it may be a metal beside glass."""
-    mixed = glass(0.5, "BLEND", transmission={"transmissionFactor": 0.5}).with_(
-        nodes=[{"mesh": 0}, {"mesh": 1}], scenes=[{"nodes": [0, 1]}]
-    )
-    mixed.content["meshes"].append({"primitives": [{**mixed.primitive, "material": 1}]})
-    mixed.content["materials"].append({})
-    mesh, finish, said = mixed.read(tmp_path)
+    mesh, finish, said = glass(0.5, "BLEND", transmission={"transmissionFactor": 0.5}).beside({}).read(tmp_path)
     assert not said
     made = finish.complete(0.0, 0.5)
     assert (made.glass.transmission, made.transmission) == (0.75, 0.75)
     assert made.texture.shape[2] == 3
     assert set(np.unique(made.opacity)) == {0, 255}
-    column, row = (mesh.uv * (1.0, -1.0) + (0.0, 1.0)).T * np.array([[made.opacity.shape[1]], [made.opacity.shape[0]]])
-    at_vertices = made.opacity[row.astype(int), column.astype(int)]
-    assert np.bincount(at_vertices // 255).tolist() == [len(mesh.uv) // 2] * 2
+    assert np.bincount(texels(mesh, made.opacity) // 255).tolist() == [len(mesh.uv) // 2] * 2
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Clear coats and anisotropy of glTF: factors, means of textures, coordinates, parts."""
+"""Clear coats, anisotropy and emission of glTF: factors, textures, coordinates, parts."""
 
 from typing import Any
 
@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.assets.gltf.finish import brush_coordinates
 from synpick_warp.scenes.types import PLAIN, Finish
 from tests.scenes.test_gltf import COLORS, TEXTURE, UV, Builder, pbr
+from tests.worlds.model_files import texels
 
 
 def finished(coat: dict[str, Any], brushed: dict[str, Any], **more: Any) -> Builder:
@@ -51,10 +53,8 @@ def directions(mesh) -> np.ndarray:
 def test_a_part_in_an_atlas_keeps_its_directions(tmp_path, other):
     """Parts that differ in colour or in metalness are joined by a texture atlas, which replaces texture coordinates."""
     alone = finished({}, BRUSHED).read(tmp_path)[0]
-    mixed = finished({}, BRUSHED).with_(nodes=[{"mesh": 0, "scale": [2, 2, 2]}, {"mesh": 1}], scenes=[{"nodes": [0, 1]}])
-    mixed.content["meshes"].append({"primitives": [{**mixed.primitive, "material": 1}]})
-    mixed.content["materials"].append({**mixed.content["materials"][0], **pbr(**other)})
-    joined, found, said = mixed.read(tmp_path)
+    mixed = finished({}, BRUSHED)
+    joined, found, said = mixed.beside({**mixed.content["materials"][0], **pbr(**other)}, 2.0, 1.0).read(tmp_path)
     assert (found.finish.anisotropy, said) == (0.75, [])
     np.testing.assert_allclose(directions(joined), np.tile(directions(alone), (2, 1)), atol=1e-5)
 
@@ -76,10 +76,8 @@ def test_anisotropic_surfaces_keep_or_get_coordinates(tmp_path):
 
 
 def test_the_largest_part_has_the_finish_of_all(tmp_path):
-    mixed = finished(COAT, {}).with_(nodes=[{"mesh": 0}, {"mesh": 1, "scale": [2, 2, 2]}], scenes=[{"nodes": [0, 1]}])
-    mixed.content["meshes"].append({"primitives": [{**mixed.primitive, "material": 1}]})
-    mixed.content["materials"].append({"extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 1.0}}})
-    _, found, said = mixed.read(tmp_path)
+    larger = {"extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 1.0}}}
+    _, found, said = finished(COAT, {}).beside(larger, 1.0, 2.0).read(tmp_path)
     assert found.finish == Finish(1.0)
     assert said == ["ignored: clearcoat and anisotropy but for those of the largest part"]
 
@@ -91,23 +89,68 @@ def test_vertex_colours_leave_no_direction(tmp_path):
     assert said == ["ignored: anisotropy beneath vertex colours"]
 
 
+# ---- emission ----
+
+
+def shining(strength: float = 1.0, **more: Any) -> Builder:
+    named = {"KHR_materials_emissive_strength": {"emissiveStrength": strength}}
+    return Builder(emissiveFactor=[1.0, 0.5, 0.0], extensions=named, **more).with_(extensionsUsed=list(named))
+
+
+def test_emission_is_factor_times_strength_times_texture(tmp_path):
+    _, finish, said = shining(4.0).read(tmp_path)
+    assert finish.complete(0.0, 0.5).emission == (4.0, 2.0, 0.0)
+    assert finish.complete(0.0, 0.5).glow is None
+    _, finish, more = shining(4.0, emissiveTexture={"index": 0}).image().attribute("TEXCOORD_0", UV).read(tmp_path)
+    made = finish.complete(0.0, 0.5)
+    assert made.emission == (4.0, 2.0, 0.0)
+    for row, column in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
+        np.testing.assert_array_equal(made.glow[row, column], COLORS[row, column])
+    assert not said + more
+
+
+def test_an_emission_texture_that_is_not_used_leaves_no_emission(tmp_path):
+    _, finish, said = shining(emissiveTexture={"index": 0}).image().read(tmp_path)
+    assert finish.complete(0.0, 0.5).emission == (0.0, 0.0, 0.0)
+    assert said == ["ignored: maps without texture coordinates"]
+    other = shining(emissiveTexture={"index": 0, "texCoord": 1}, **pbr(**TEXTURE)).image().attribute("TEXCOORD_0", UV)
+    _, finish, said = other.read(tmp_path)
+    assert finish.complete(0.0, 0.5).emission == (0.0, 0.0, 0.0)
+    assert said == ["ignored: emissiveTexture with other texture coordinates"]
+
+
+def test_parts_keep_their_emission(tmp_path):
+    """A lamp beside a part that emits nothing: an emission texture tells them apart."""
+    mesh, finish, said = shining(2.0).beside({}).read(tmp_path)
+    made = finish.complete(0.0, 0.5)
+    light = srgb_to_linear(texels(mesh, made.glow) / 255.0) * made.emission
+    shines = light[:, 0] > 1.0
+    assert shines.sum() == len(mesh.uv) // 2
+    np.testing.assert_allclose(light[shines], np.broadcast_to([2.0, 1.0, 0.0], (shines.sum(), 3)), atol=0.01)
+    np.testing.assert_array_equal(light[~shines], 0.0)
+    assert not said
+
+
+def test_a_part_too_faint_beside_another_is_named(tmp_path):
+    mixed = shining(1e4).beside({"emissiveFactor": [1.0, 1.0, 1.0]})
+    assert mixed.read(tmp_path)[2] == ["ignored: emission of less than 1/6,500 of an object's brightest part"]
+
+
 @pytest.mark.parametrize(
-    ("coat", "brushed", "said"),
+    ("builder", "said"),
     [
-        ({"clearcoatFactor": 1.5}, {}, "clearcoatFactor is 1.5; allowed: 0 to 1; correct the material"),
-        (
-            {"clearcoatFactor": 1, "clearcoatRoughnessFactor": -1},
-            {},
-            "clearcoatRoughnessFactor is -1; allowed: 0 to 1; correct the material",
-        ),
-        ({}, {"anisotropyStrength": 2}, "anisotropyStrength is 2; allowed: 0 to 1; correct the material"),
-        ({}, {"anisotropyRotation": 1e9}, "anisotropyRotation is 1e[+]09; allowed: up to 10000; correct the material"),
-        ({"clearcoatFactor": "much"}, {}, "damaged: expected float, got str"),
-        ({}, {"anisotropyStrength": [1]}, "damaged: expected float, got array"),
-        ([], {}, "damaged: expected object, got array"),
+        (finished({"clearcoatFactor": 1.5}, {}), "clearcoatFactor is 1.5; allowed: 0 to 1; correct the material"),
+        (finished({"clearcoatRoughnessFactor": -1}, {}), "clearcoatRoughnessFactor is -1; allowed: 0 to 1; correct the material"),
+        (finished({}, {"anisotropyStrength": 2}), "anisotropyStrength is 2; allowed: 0 to 1; correct the material"),
+        (finished({}, {"anisotropyRotation": 1e9}), "anisotropyRotation is 1e[+]09; allowed: up to 10000; correct the material"),
+        (finished({"clearcoatFactor": "much"}, {}), "damaged: expected float, got str"),
+        (finished({}, {"anisotropyStrength": [1]}), "damaged: expected float, got array"),
+        (finished([], {}), "damaged: expected object, got array"),
+        (shining(-1.0), "emissiveStrength is -1; allowed: 0 to 10000; correct the material"),
+        (Builder(emissiveFactor=[0.0, 2.0, 0.0]), "emissiveFactor is 2; allowed: 0 to 1; correct the material"),
     ],
 )
-def test_a_finish_that_cannot_be_is_refused(tmp_path, coat, brushed, said):
+def test_a_finish_or_an_emission_that_cannot_be_is_refused(tmp_path, builder, said):
     with pytest.raises(CatalogError, match=said) as error:
-        finished(coat, brushed).read(tmp_path)
+        builder.read(tmp_path)
     assert "\n" not in str(error.value)

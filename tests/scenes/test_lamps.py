@@ -51,24 +51,6 @@ def loaded(folder, lines: str, image: np.ndarray) -> EnvironmentMap:
     return light
 
 
-@pytest.mark.parametrize(
-    ("u", "v", "expected"),
-    [
-        (0.5, 0.25, (1, 0, 1)),  # the picture's middle is +x
-        (0.75, 0.25, (0, -1, 1)),  # right of it, as seen from inside, is -y
-        (0.25, 0.25, (0, 1, 1)),
-        (0.0, 0.25, (-1, 0, 1)),
-        (1.0, 0.25, (-1, 0, 1)),
-        (0.3, 0.0, (0, 0, 1)),  # v grows down from the zenith
-        (0.5, 0.4, (np.sin(0.4 * np.pi), 0, np.cos(0.4 * np.pi))),
-    ],
-)
-def test_u_and_v_grow_right_and_down(tmp_path, u, v, expected):
-    sun = loaded(tmp_path, f"SUNu = {u}\nSUNv = {v}\n", EVEN).sun
-    assert sun is not None
-    np.testing.assert_allclose(sun.direction, np.array(expected) / np.linalg.norm(expected), atol=1e-12)
-
-
 @given(u=st.floats(0.0, 0.999), v=st.floats(0.03, 0.47))
 def test_the_sun_of_a_set_is_at_the_bright_pixel_of_its_map(u, v, tmp_path_factory):
     light = loaded(tmp_path_factory.mktemp("set"), f"SUNu = {u}\nSUNv = {v}\n", bright_picture(u, v))

@@ -274,17 +274,6 @@ def test_a_reflected_part_keeps_outward_orientation(tmp_path):
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(0.012)
 
 
-def test_an_obj_with_an_image(tmp_path):
-    put(tmp_path / "a.mtl", "newmtl skin\nKd 0 0 0\nmap_Kd skin.png\n")
-    picture(tmp_path / "skin.png")
-    mesh, finish = read(tmp_path / "a.obj", OBJ)
-    assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
-    assert set(map(tuple, mesh.uv)) == {(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)}
-    assert finish.texture is not None
-    assert np.all(finish.texture == (200, 10, 30))
-    assert finish.color == (1.0, 1.0, 1.0)
-
-
 GOOD = ascii_ply(CORNERS, FACES)
 UNWRAPPED = ("x", "y", "z", "texture_u", "texture_v")
 BARE_OBJ = "mtllib a.mtl\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS)

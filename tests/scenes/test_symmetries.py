@@ -291,7 +291,7 @@ def test_symmetries_are_found_once_for_a_mesh_and_a_tolerance(tmp_path, monkeypa
     found, block, disc = [], MAKE.box((0.03, 0.04, 0.05)), MAKE.cylinder(0.02, 0.01, sections=12)
     monkeypatch.setattr(cache, "find_symmetries", lambda *given: found.append(find_symmetries(*given)) or found[-1])
     folder = tmp_path / "new"
-    given = [(body.vertices, body.faces, 0.1, tolerance) for body, tolerance in ((block, 0.003), (disc, 0.003), (block, 0.004))]
+    given = [(body.vertices, body.faces, 0.1, tolerance) for body, tolerance in ((block, 0.003), (disc, 0.003), (block, 0.002))]
 
     def bits(found):
         turns = [*found.continuous, *([found.missed] if found.missed else [])]

@@ -111,8 +111,9 @@ def test_vertex_0_is_refused(tmp_path, face):
 )
 @pytest.mark.parametrize("name", ["skin.png", "two words.png", "skin.png # wood"])
 def test_options_of_a_texture(tmp_path, options, scale, offset, said, name):
-    mesh, finish, line = read(tmp_path, f"newmtl skin\nmap_Kd {options} {name}\n")
+    mesh, finish, line = read(tmp_path, f"newmtl skin\nKd 0 0 0\nmap_Kd {options} {name}\n")
     assert tuple(finish.texture[0, 0]) == ((0, 255, 0) if name == "two words.png" else (200, 10, 30))
+    assert finish.color == (1.0, 1.0, 1.0)
     assert np.unique(mesh.uv, axis=0) == pytest.approx(np.unique(UV[:3] * scale + offset, axis=0))
     assert line == said
 

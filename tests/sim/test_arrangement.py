@@ -176,12 +176,6 @@ def test_each_split_has_its_own_mode(device):
 # ---- objects ----
 
 
-def test_a_budget_for_everything_draws_everything_without_repeats(device):
-    worlds = drawn(device, drop={"volume": 10.0, "move_repeats": 0})
-    assert (np.sort(worlds["catalog_index"], axis=1)[:, -3:] == [0, 1, 2]).all()
-    assert len(np.unique(worlds["catalog_index"], axis=0)) == 6
-
-
 @pytest.mark.parametrize("counts", [[(0, 0), (8, 8), (0, 0)], [(3, 3), (4, 4), (1, 1)], [(0, 2), (1, 3), (2, 3)]])
 def test_numbers_of_parts_are_those_that_are_set_whatever_the_budget(device, counts):
     """Homogeneous, kitted and random fills, with a compound object among the parts; results do not depend on the number of worlds."""

@@ -129,31 +129,6 @@ def test_nothing_but_objects_is_hit(device):
     assert cups.attached()[0] == [0, 0, 0, 0]
 
 
-def test_each_ray_catches_what_is_nearest(device):
-    cups = Cups(device, worlds=3)
-    # One above the other; side by side; a bar on a plate.
-    cups.lay(0, 1, 0, below(0.020))
-    cups.lay(0, 3, 0, below(0.005))
-    cups.lay(1, 0, 0, below(0.01) - [0.15 + 0.002, 0.0, 0.0])
-    cups.lay(1, 3, 0, below(0.02) - [-0.15 - 0.002, 0.0, 0.0])
-    cups.lay(2, 0, 0, below(0.022))
-    cups.lay(2, 1, 1, PLACE - [0.0, -0.01, 0.012])
-    assert cups.cast() == ([RAYS, RAYS, RAYS], [0b1000, 0b1001, 0b11])
-    assert cups.attached() == [[0, 0, 0, 1], [1, 0, 0, 1], [1, 1, 0, 0]]
-    assert (cups["break_force"] == GOOD).all()
-
-
-# In the angle's frame: over the bar, the arm, the notch, the arm's edge, and the notch's corner, into whose quarter three rays fall.
-@pytest.mark.parametrize(
-    ("x", "y", "count"), [(0.03, 0.0, 10), (-0.03, 0.05, 10), (0.02, 0.045, 0), (-0.015, 0.045, 5), (-0.015, 0.016, 7)]
-)
-def test_the_notch_of_an_angle_is_open(device, x, y, count):
-    """The bar is 9 cm x 3 cm about the origin; the arm, 3 cm x 6 cm, stands beside it at x < -1.5 cm."""
-    cups = Cups(device)
-    cups.lay(0, 0, 2, PLACE - [x, y, 0.015 + 0.005])
-    assert cups.cast()[0] == [count]
-
-
 @pytest.mark.parametrize(
     ("phase", "task", "steps"),
     [(Phase.SETTLE, Task.PRESS, 5), (Phase.ACT, Task.DESCEND, 5), (Phase.ACT, Task.LIFT, 9), (Phase.ACT, Task.PRESS, 4)],

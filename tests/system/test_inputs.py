@@ -336,17 +336,6 @@ def test_hostile_files_are_one_line_at_once(tmp_path, text, said):
     assert said in refusal_at_once(tmp_path / "my.toml")
 
 
-def test_files_that_are_not_regular_are_refused(tmp_path):
-    """Fault 18: a FIFO hung, /dev/zero was read until memory ended."""
-    os.mkfifo(tmp_path / "fifo.toml")
-    (tmp_path / "zero.toml").symlink_to("/dev/zero")
-    (tmp_path / "loop.toml").symlink_to("loop.toml")
-    for name in ("fifo", "zero"):
-        assert refusal_at_once(tmp_path / f"{name}.toml") == f"{tmp_path}/{name}.toml is not a regular file"
-    assert "cannot be read" in refusal_at_once(tmp_path / "loop.toml")
-    assert "there is no file" in refusal_at_once(Path("a\0.toml"))
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -156,19 +156,6 @@ def test_an_obj_id_that_does_not_fit_the_layer_is_an_error(device, number):
 # ---- optical flow and scene flow ----
 
 
-@pytest.mark.parametrize("step", [(0.1, 0.05, 0.0), (0.0, 0.0, 0.5)])
-def test_flow_of_a_translation(device, step):
-    """At depth 1 m and 100 px a metre: 10 px to the right and 5 px up; or towards the camera, to half the distance."""
-    toy = single(sheet(0.4, 0.4), (*step, *UPRIGHT), camera(160, 90, 100.0, (0.0, 0.0, 1.0)))
-    rendered = render_layers(toy, device, PreviousFrame([[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], [1]))
-    rows, columns = np.nonzero(rendered.segment[0] == 1)
-    # Twice as far away, every point was half as far from the image's centre.
-    expected = (-10.0, 5.0) if step[0] else np.stack([80 - columns - 0.5, 45 - rows - 0.5], axis=1) / 2
-    np.testing.assert_allclose(rendered["flow"][0][rows, columns], np.broadcast_to(expected, (len(rows), 2)), atol=1e-5)
-    # In the axes of the camera, which looks down.
-    np.testing.assert_allclose(rendered["scene_flow"][0][rows, columns], np.tile((-step[0], step[1], step[2]), (len(rows), 1)), atol=1e-7)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_flow_agrees_with_poses_in_float64(device, seed):
     rng = np.random.default_rng(seed)

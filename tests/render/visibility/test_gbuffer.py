@@ -27,43 +27,6 @@ def test_the_fixtures_segments_follow_each_other():
     assert len(buffers.FIXTURES) == gbuffer.FIXTURES
 
 
-def test_a_ball_shows_its_area_and_its_nearest_depth(device):
-    picture = render(one(ball(0.1, 5), (0.0, 0.0, 0.3, *UPRIGHT), camera(161, 91, 400.0, (0.0, 0.0, 1.3))), device, colors=False)
-    # The silhouette of a sphere of radius r at distance d is a circle of radius f r / sqrt(d² - r²).
-    area = np.pi * (400.0 * 0.1) ** 2 / (1.0 - 0.1**2)
-    assert abs((picture.instance[0] == 1).sum() / area - 1.0) < 0.01
-    assert picture.depth[0, 45, 80] == 9000
-    assert picture.amodal[0, 45, 80] == 1
-    assert picture.depth[0, 0, 0] == 0
-    assert picture.instance[0, 0, 0] == Segment.NOTHING
-
-
-def test_pixel_centres_have_half_integer_coordinates(device):
-    # A sheet whose edges project to columns 70.25 and 80.25 and rows 35.75 and 45.75: it holds the centres of columns 70 to 79 and
-    # rows 36 to 45. Were centres at whole numbers, it would hold columns 71 to 80.
-    view = camera(160, 90, 100.0, (0.0, 0.0, 1.0))
-    x, y = (75.25 - 80.0) / 100.0, -(40.75 - 45.0) / 100.0
-    picture = render(one(sheet(0.1, 0.1), (x, y, 0.0, *UPRIGHT), view), device, colors=False)
-    rows, columns = np.nonzero(picture.instance[0])
-    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (70, 79, 36, 45)
-    assert len(rows) == 100
-    assert (picture.depth[0][picture.instance[0] == 1] == 10000).all()
-
-
-def test_occluded_instances_keep_their_amodal_bits(device):
-    toy = one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW)
-    toy.placed[0] += [(0, (0.05, 0.0, 0.1, *UPRIGHT)), (0, (0.0, 0.03, -0.1, *UPRIGHT))]
-    picture = render(toy, device, colors=False)
-    bits, instance = picture.amodal[0], picture.instance[0]
-    assert bits[45, 80] == 0b111
-    assert instance[45, 80] == 2
-    left = 80 - int(0.08 * 453.7 / 2.0)
-    assert bits[45, left] == 0b101
-    assert instance[45, left] == 1
-    assert (bits[instance == 3] == 0b100).all()
-    assert ((bits >> (np.maximum(instance, 1) - 1)) & 1)[instance > 0].all()
-
-
 def test_a_world_without_instances_shows_none(device):
     toy = one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW)
     toy.placed = [[], toy.placed[0]]
