@@ -368,20 +368,6 @@ class Linked:
         return made
 
 
-@pytest.mark.parametrize(
-    ("world", "follows"),
-    [
-        ([(0, 4, -1), (1, 4, 0), (1, 4, 1), (1, 4, 2), (0, 7, -1), (1, 7, 0), (1, 7, 1)], [0, 0, 1, 1, 0, 0, 1]),
-        # The last frame of a failed try is not live; then the same number comes again from frame 0.
-        ([(1, 4, 0), (1, 4, 1), (0, 4, 2), (0, 4, -1), (1, 4, 0), (1, 4, 1)], [0, 1, 0, 0, 0, 1]),
-    ],
-    ids=["never across episodes", "drawn again"],
-)
-def test_frames_follow_within_an_episode(world, follows):
-    linked = Linked()
-    assert [linked.tick([tick] * LINKED_WORLDS).follows.numpy()[0] for tick in world] == follows
-
-
 @given(st.lists(TICK, min_size=1, max_size=6))
 @examples(max_examples=30)
 def test_every_snapshot_has_the_one_before_beside_it(script):

@@ -181,20 +181,6 @@ def paste(part: np.ndarray, top: int, left: int, height: int, width: int) -> np.
     return full
 
 
-@pytest.mark.parametrize(
-    ("mask", "counts"),
-    [
-        ([[0, 0], [0, 0]], [4]),
-        ([[1, 1], [1, 1]], [0, 4]),
-        ([[0, 1], [1, 0]], [1, 2, 1]),
-        ([[1, 0], [0, 0]], [0, 1, 3]),
-        ([[0, 0, 0], [0, 1, 1]], [3, 1, 1, 1]),
-    ],
-)
-def test_known_run_lengths(mask, counts):
-    assert find_runs(np.array(mask, np.uint8)).counts(*np.shape(mask)).tolist() == counts
-
-
 @pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0), (2, 3)])
 def test_an_empty_crop_has_no_runs(shape):
     runs = find_run_boundaries(np.zeros(shape, np.uint8), 2, 1).split_by_value([MAX_INSTANCES - 1])[0]

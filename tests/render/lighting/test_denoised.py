@@ -11,7 +11,6 @@ import warp as wp
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.lighting.paths.tracing import BRDF_SAMPLING, LIGHT_SAMPLING
-from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import allocate_view_buffers
 from synpick_warp.stages.render import reference
@@ -236,20 +235,6 @@ def test_grey_plane_under_a_uniform_map_equals_the_reference(device, table):
     denoised, reference = (picture.radiance.mean(axis=(0, 1, 2)) for picture in pictures)
     np.testing.assert_allclose(denoised, reference, rtol=0.01)
     np.testing.assert_allclose(denoised, 0.5, rtol=0.1)
-
-
-@pytest.mark.parametrize(("degrees", "lamps"), [(1.0, 1), (3.0, 1), (5.0, 1), (12.0, 6)])
-def test_tables_split_a_map_into_lamps_and_the_rest(degrees, lamps):
-    tables = precompute_environment(lamp(0.7, np.radians(degrees), 200.0, 0.2), None)
-    assert len(tables.lamps) == lamps
-    assert tables.lampless.max() < (10.0 if lamps == 1 else 201.0)
-    # No light is lost or counts twice.
-    directions, solid_angles = map_directions(len(tables.lampless))
-    for normal in (toward(1.0), toward(0.5, 1.0), toward(0.7, -0.4)):
-        cosine = np.maximum(directions @ normal, 0.0) * solid_angles
-        whole, rest = ((image * cosine[..., None]).sum(axis=(0, 1)) for image in (tables.radiance, tables.lampless))
-        light = sum(each.irradiance * max(float(normal @ each.direction), 0.0) for each in tables.lamps)
-        np.testing.assert_allclose(rest + light, whole, rtol=5e-3)
 
 
 def test_cluttered_scene_approaches_the_reference(device):
