@@ -1,6 +1,7 @@
 """Triangle rasterizer, behind pinholes and lenses: its G-buffer equals that of ray tracing, of float64 and of OpenCV, for any triangles."""
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -46,13 +47,22 @@ def triangles(corners: np.ndarray) -> TriangleMesh:
     return flat_shaded(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
-def gbuffer_of(toy: ToyScene, device: wp.Device, by_rays: bool = False) -> dict[str, np.ndarray]:
-    """G-buffer and amodal bits of world 0 seen by camera 0; `by_rays`: the G-buffer by ray tracing."""
+def arrays_of(gbuffer: Any) -> dict[str, np.ndarray]:
+    return {name: getattr(gbuffer, name).numpy()[0].copy() for name in ("segment", "triangle", "barycentric", "depth")}
+
+
+def gbuffer_of(toy: ToyScene, device: wp.Device) -> dict[str, np.ndarray]:
+    """G-buffer and amodal bits of world 0 seen by camera 0."""
     out, renderer = render_gbuffer(toy, device)
-    if by_rays:
-        trace_gbuffer(renderer.scene, renderer.bodies, views_of(toy, device, renderer.cameras), renderer.gbuffer, 1)
-    found = {name: getattr(renderer.gbuffer, name).numpy()[0].copy() for name in ("segment", "triangle", "barycentric", "depth")}
-    return found | {"amodal": bits_of(masks_of_buffers(out))[0]}
+    return arrays_of(renderer.gbuffer) | {"amodal": bits_of(masks_of_buffers(out))[0]}
+
+
+def gbuffers_of(toy: ToyScene, device: wp.Device) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """G-buffers of world 0 seen by camera 0: rasterized, and by ray tracing."""
+    _, renderer = render_gbuffer(toy, device)
+    rasterized = arrays_of(renderer.gbuffer)
+    trace_gbuffer(renderer.scene, renderer.bodies, views_of(toy, device, renderer.cameras), renderer.gbuffer, 1)
+    return rasterized, arrays_of(renderer.gbuffer)
 
 
 def depth_in_float64(corners: np.ndarray, view=VIEW) -> tuple[np.ndarray, np.ndarray]:
@@ -124,7 +134,7 @@ def test_ray_tracing_gives_the_same_gbuffer(device, seed):
     fixtures = (Fixture(box(0.7, 0.5, 0.02), GREY), Fixture(box(0.05, 0.05, 0.3), GREY), Fixture(ball(0.04, 3), GREY))
     placed = ((0.01, 0.0, 0.0, *UPRIGHT), (0.1, 0.1, 0.4, *UPRIGHT), (0.1, 0.1, 0.2, *UPRIGHT))
     toy = several(meshes, poses, VIEW, fixtures=fixtures, fixture_poses=placed, fixtures_visible=(1, 1, 1), table=True)
-    ours, theirs = gbuffer_of(toy, device), gbuffer_of(toy, device, by_rays=True)
+    ours, theirs = gbuffers_of(toy, device)
     # On a GPU the two ray tests round differently: rays within rounding of an edge may pass it on either side.
     differs = ours["segment"] != theirs["segment"]
     assert differs.sum() <= (2 if device.is_cuda else 0)
@@ -170,7 +180,7 @@ def test_the_order_of_triangles_and_bodies_does_not_matter(device):
 @pytest.mark.parametrize("capacity", [0, 3, raster.BLOCKS])
 def test_large_triangles_are_complete_with_any_capacity_for_blocks(device, capacity, monkeypatch):
     toy = one(box(0.3, 0.2, 0.1), (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927), camera(192, 128, 300.0, (0.0, 0.0, 1.0)))
-    expected = gbuffer_of(toy, device, by_rays=True)
+    _, expected = gbuffers_of(toy, device)
     monkeypatch.setattr(raster, "BLOCKS", capacity)
     monkeypatch.setattr(raster, "INSTANCE_BLOCKS", 0)
     found = gbuffer_of(toy, device)
@@ -288,8 +298,8 @@ def opencv_pixels(view: Camera, points: np.ndarray) -> np.ndarray:
 @given(name=st.sampled_from(sorted(VIEWS)), seed=st.integers(0, 2**32 - 1), size=st.sampled_from([0.003, 0.03, 0.3, 2.0]))
 def test_the_rasterizer_misses_no_ray(name, seed, size):
     """Triangles all over and beside the image, some through the camera's plane: their footprints bound their bent images."""
-    toy, device = one(triangles(random_triangles(seed, 30, size, 0.8)), FLAT, VIEWS[name]), pick_device(default_device())
-    ours, theirs = gbuffer_of(toy, device), gbuffer_of(toy, device, by_rays=True)
+    device = pick_device(default_device())
+    ours, theirs = gbuffers_of(one(triangles(random_triangles(seed, 30, size, 0.8)), FLAT, VIEWS[name]), device)
     differs = ours["segment"] != theirs["segment"]
     assert differs.sum() <= (2 if device.is_cuda else 0)
     # Both are float32, and depth is interpolated over two metres: of 70 seeds, the worst differs by 5e-5.
