@@ -32,7 +32,7 @@ class SceneIndex:
     def files(self, episode: int, camera: int) -> SceneFiles:
         """Files of the scene of a camera and episode: a folder, or else shards. Raises DatasetError if the data set has no images of it."""
         from synpick_warp.dataset.view_files import SceneFolder, SceneShards
-        from synpick_warp.exporters.bop.shards.tar_files import find_shards
+        from synpick_warp.exporters.bop.shards import find_shards
 
         folder, web = self._folders[self._layout.folder(episode)]
         index, suffix = self._layout.scene(episode, camera)

@@ -156,7 +156,7 @@ FORMAT_TABLE: dict[str, Format] = {
         view_bytes=739e3,
     ),
     "shards": Format(
-        ".bop.shards.exporter",
+        ".bop.shards",
         "ShardsExporter",
         _SCENE_CONSTANTS,
         _shards,
@@ -200,7 +200,7 @@ FORMAT_TABLE: dict[str, Format] = {
         remedy="install it by pip install 'synpick-warp[lerobot]'",
     ),
     "coco": Format(
-        ".bop.coco.exporter",
+        ".bop.coco",
         "CocoExporter",
         rf"coco/categories\.json|{_NOTES}",
         _coco,
@@ -210,7 +210,7 @@ FORMAT_TABLE: dict[str, Format] = {
         view_bytes=480e3,
     ),
     "yolo": Format(
-        ".bop.yolo.exporter",
+        ".bop.yolo",
         "YoloExporter",
         rf"yolo/data\.yaml|{_NOTES}",
         _yolo,
@@ -219,7 +219,7 @@ FORMAT_TABLE: dict[str, Format] = {
         view_bytes=480e3,
     ),
     "points": Format(
-        ".bop.points.exporter",
+        ".bop.points",
         "PointsExporter",
         _NOTES,
         _points,

@@ -22,7 +22,7 @@ from synpick_warp.dataset.view import Tracks
 from synpick_warp.dataset.webdataset import decode_view
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
-from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.testing import box_views
 from synpick_warp.testing.box_views import OBJECT_IDS, SIZES, batches, config
 from synpick_warp.testing.exporters import FRAMES, LENSES, export

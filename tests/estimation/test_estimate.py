@@ -26,7 +26,7 @@ from synpick_warp.apps.estimation.run import (
 from synpick_warp.apps.estimation.scenes import ScenePlan
 from synpick_warp.cli.commands.evaluate import parse_indices
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
-from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.testing.box_views import SIZES
 from tests.builders import mistake, refusal, run

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from synpick_warp.errors import CatalogError, LightError, SynpickError
-from synpick_warp.exporters.bop.shared.models import write_models
+from synpick_warp.exporters.bop.shared import write_models
 from synpick_warp.scenes.assets import asset_files
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.system.processes import isolation

@@ -22,7 +22,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError, LightError, SynpickError
-from synpick_warp.exporters.bop.shared.models import write_models
+from synpick_warp.exporters.bop.shared import write_models
 from synpick_warp.scenes.assets.asset_files import MAX_ROWS
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import read_models_info

@@ -14,7 +14,7 @@ from synpick_warp.apps.evaluation.errors import read_models
 from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.configs.schema import ObjectRow
 from synpick_warp.errors import CatalogError
-from synpick_warp.exporters.bop.shared.models import write_models
+from synpick_warp.exporters.bop.shared import write_models
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.collision.hulls import hull_size

@@ -14,7 +14,7 @@ from PIL import Image
 from trimesh.exchange.gltf import export_gltf
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.exporters.bop.shared.models import write_models
+from synpick_warp.exporters.bop.shared import write_models
 from synpick_warp.scenes.assets.mesh_parts import clip_ears, find_concave
 from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.normals import crease_normals, smooth_normals

@@ -27,7 +27,7 @@ from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS
+from synpick_warp.exporters.bop.shared import MODEL_FOLDERS
 from synpick_warp.exporters.formats import FORMAT_TABLE, contents_of, convertible
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL, Buffer, check_output_folder, output_error, output_errors, write_atomically

@@ -12,6 +12,7 @@ from synpick_warp.configs.cell.cameras import COLOR, DEPTH, MASKS
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Bop
 from synpick_warp.exporters.base import EpisodeExporter, ExportContext, SharedFiles, StagedEpisode, StoredScene, view_bytes
+from synpick_warp.exporters.bop import shared
 from synpick_warp.exporters.bop import view as bop_view
 from synpick_warp.exporters.bop.scene import (
     FrameSupport,
@@ -24,16 +25,6 @@ from synpick_warp.exporters.bop.scene import (
     write_layer,
     write_view,
 )
-from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, PARAMS_FILE, describe_dataset, format_dataset_params, write_models
-from synpick_warp.exporters.bop.shared.targets import (
-    concatenate_targets,
-    find_scenes,
-    make_scene_targets,
-    scene_target_files,
-    sensor_suffixes,
-    target_files,
-    write_scene_targets,
-)
 from synpick_warp.exporters.bop.view import ViewSettings, make_category_keys, sample_keypoints
 from synpick_warp.exporters.writing.files import LINES, PARTIAL, output_errors
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE, camera_files, write_cameras
@@ -44,7 +35,7 @@ from synpick_warp.views.picks import PickBatch
 
 def constant_files(layout: DataLayout) -> tuple[Path, ...]:
     """Names of the files that all scenes share."""
-    return tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, *camera_files(layout), NOTES_FILE, PARAMS_FILE)))
+    return tuple(map(Path, (*shared.MODEL_FOLDERS, CAMERA_FILE, *camera_files(layout), NOTES_FILE, shared.PARAMS_FILE)))
 
 
 MAX_RUNNING = 4096
@@ -142,10 +133,10 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             if context.copy_constants(names):
                 return list(names)
             texts = {
-                NOTES_FILE: describe_dataset(context.settings, context.catalog, self._cameras),
-                PARAMS_FILE: format_dataset_params(context.settings, context.catalog, self._cameras),
+                NOTES_FILE: shared.describe_dataset(context.settings, context.catalog, self._cameras),
+                shared.PARAMS_FILE: shared.format_dataset_params(context.settings, context.catalog, self._cameras),
             }
-            write_models(context.catalog, *(self._out / name for name in MODEL_FOLDERS), mechanics=self._bop.graph)
+            shared.write_models(context.catalog, *(self._out / name for name in shared.MODEL_FOLDERS), mechanics=self._bop.graph)
             write_cameras(self._out, context.layout, self._cameras, self._bop.depth_scale)
             for name, text in texts.items():
                 (self._out / name).write_text(text, encoding="utf-8", newline="\n")
@@ -234,12 +225,12 @@ class BopExporter(SceneExporter):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        return SharedFiles(constant_files(layout), tuple(map(Path, target_files(layout))), BopExporter.folders(layout))
+        return SharedFiles(constant_files(layout), tuple(map(Path, shared.target_files(layout))), BopExporter.folders(layout))
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         layout = settings.layout
-        parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(layout), sensor_suffixes(layout)
+        parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", shared.target_files(layout), shared.sensor_suffixes(layout)
         with output_errors(out):
             known = (out / LINES).is_dir()
             if known:
@@ -251,20 +242,20 @@ class BopExporter(SceneExporter):
             for name in names:
                 (parts / name).mkdir(exist_ok=known)
             for folder in () if known else layout.folders:
-                places = tuple(str(parts / name) for name in scene_target_files(layout, folder))
-                for scene in find_scenes(out / folder, layout.scene_ids(episodes)):
-                    pool.submit(write_scene_targets, (), (scene, places, settings.bop.target_visibility, sensors), path=scene)
+                places = tuple(str(parts / name) for name in shared.scene_target_files(layout, folder))
+                for scene in shared.find_scenes(out / folder, layout.scene_ids(episodes)):
+                    pool.submit(shared.write_scene_targets, (), (scene, places, settings.bop.target_visibility, sensors), path=scene)
             pool.wait()
-            concatenate_targets(parts, out, names)
+            shared.concatenate_targets(parts, out, names)
         return [Path(name) for name in names]
 
     @staticmethod
     def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-        layout, sensors = settings.layout, sensor_suffixes(settings.layout)
+        layout, sensors = settings.layout, shared.sensor_suffixes(settings.layout)
         truths = filter(lambda path: path.name == f"scene_gt{sensors[0]}.json", map(Path, names))
         for scene in sorted((path.parent for path in truths), key=lambda scene: int(scene.name)):
-            lists = make_scene_targets(out / scene, settings.bop.target_visibility, sensors)
-            for name, lines in zip(scene_target_files(layout, scene.parent.name), lists, strict=False):
+            lists = shared.make_scene_targets(out / scene, settings.bop.target_visibility, sensors)
+            for name, lines in zip(shared.scene_target_files(layout, scene.parent.name), lists, strict=False):
                 yield f"{name}/0", lines
 
     def write_picks(self, batch: PickBatch) -> None:

@@ -29,8 +29,7 @@ from synpick_warp.dataset.trajectory import GroupContext
 from synpick_warp.dataset.view_files import SceneShards
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
-from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
-from synpick_warp.exporters.bop.shards.tar_files import key_lines
+from synpick_warp.exporters.bop.shards import ShardsExporter, key_lines
 from synpick_warp.exporters.trajectory.arrays import STEPS
 from synpick_warp.system.inputs.image_files import decode_image, image_size
 from synpick_warp.system.inputs.tar_files import list_members

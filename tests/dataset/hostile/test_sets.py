@@ -21,8 +21,8 @@ from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums, 
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import OutputError, SynpickError
-from synpick_warp.exporters.bop.shards.tar_files import list_keys
-from synpick_warp.exporters.bop.shared import targets
+from synpick_warp.exporters.bop import shared
+from synpick_warp.exporters.bop.shards import list_keys
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.exporters.writing.files import check_output_folder
 from synpick_warp.factory.episodes import BakeSummary
@@ -301,7 +301,7 @@ def test_a_full_disk_names_the_file_that_could_not_be_written(parts, tmp_path, m
 def test_damaged_scenes_are_one_line_or_targets(ready, tmp_path_factory, data):
     scene = tmp_path_factory.mktemp("scene") / "000000"
     scene.mkdir()
-    places = str(scene.parent / targets.BOP19), str(scene.parent / targets.BOP24)
+    places = str(scene.parent / shared.BOP19), str(scene.parent / shared.BOP24)
     for place in places:
         Path(place).mkdir()
     for name in ("scene_gt.json", "scene_gt_info.json"):
@@ -309,7 +309,7 @@ def test_damaged_scenes_are_one_line_or_targets(ready, tmp_path_factory, data):
     path = scene / data.draw(st.sampled_from(["scene_gt.json", "scene_gt_info.json"]))
     path.write_bytes(draw_hostile(data, path.read_bytes()))
     with fine_or_one_line():
-        targets.write_scene_targets(scene, places, 0.1)
+        shared.write_scene_targets(scene, places, 0.1)
 
 
 @examples(max_examples=fuzz_examples(100), deadline=None)

@@ -25,7 +25,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop.scene import CHECKSUMS, SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
-from synpick_warp.exporters.bop.shared.models import encode_model, write_models
+from synpick_warp.exporters.bop.shared import encode_model, write_models
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.files import PARTIAL, open_folder, spooled_checksums, write_checksums

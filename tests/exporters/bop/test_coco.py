@@ -25,15 +25,13 @@ from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Arrangement, Split
 from synpick_warp.errors import DatasetError, OutputError
-from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS, commit_scenes, write_view
-from synpick_warp.exporters.bop.coco.exporter import CocoExporter
+from synpick_warp.exporters.bop import yolo
+from synpick_warp.exporters.bop.coco import CATEGORIES, IMAGES, PARTS, CocoExporter, commit_scenes, write_view
 from synpick_warp.exporters.bop.outlines import Polygon, join_parts, trace_outlines
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
-from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.exporters.bop.view import Keypoints, ViewSettings, project_keypoints, sample_keypoints
-from synpick_warp.exporters.bop.yolo import label_files
-from synpick_warp.exporters.bop.yolo.exporter import YoloExporter
-from synpick_warp.exporters.bop.yolo.label_files import CONTENTS
+from synpick_warp.exporters.bop.yolo import CONTENTS, YoloExporter
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.exporters.usd.exporter import UsdExporter
@@ -267,13 +265,13 @@ def test_segments_of_several_parts_are_one_row_and_scenes_are_complete(tmp_path)
     settings = ViewSettings(".jpg", 95, (), masks=True, coco=True, camera={}, resolution=(4, 3), classes=(5,))
     runs = find_run_boundaries(mask).runs_of(1)
     view = SimpleNamespace(scene=0, frame=0, color=(".jpg", b"image"), gt=[{"obj_id": 5}], masks=lambda: [Masks(runs, runs)])
-    label_files.write_view(view, tmp_path, settings)
+    yolo.write_view(view, tmp_path, settings)
     assert (tmp_path / "boxes" / "000000_000000.txt").read_text() == "0 0.500000 0.500000 1.000000 0.333333\n"
     assert len((tmp_path / "labels" / "000000_000000.txt").read_text().split()) == 1 + 2 * (4 + 4 + 2)
     with pytest.raises(DatasetError, match="obj_id 5, which is none of the objects"):
-        label_files.write_view(view, tmp_path, dataclasses.replace(settings, classes=(6,)))
+        yolo.write_view(view, tmp_path, dataclasses.replace(settings, classes=(6,)))
     with pytest.raises(OutputError, match="has 1 of 3 frames"):
-        label_files.commit_scenes(((tmp_path, 7),), tmp_path, "train_pbr", (range(3),))
+        yolo.commit_scenes(((tmp_path, 7),), tmp_path, "train_pbr", (range(3),))
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,7 @@ import pytest
 import trimesh
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.points.cloud_files import POINT, write_view
-from synpick_warp.exporters.bop.points.exporter import PointsExporter
+from synpick_warp.exporters.bop.points import POINT, PointsExporter, write_view
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.rle import find_run_boundaries
 from synpick_warp.testing.box_views import SIZES, batches, config

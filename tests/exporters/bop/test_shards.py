@@ -19,9 +19,9 @@ from webdataset import tariterators
 
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Config, Split
+from synpick_warp.exporters.bop import shards
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
-from synpick_warp.exporters.bop.shards import tar_files
-from synpick_warp.exporters.bop.shards.exporter import CARD_FILE, ShardsExporter, SplitContent, hub_splits, make_card, size_category
+from synpick_warp.exporters.bop.shards import CARD_FILE, ShardsExporter, SplitContent, hub_splits, make_card, size_category
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.registry import Exporters
 from synpick_warp.testing.box_views import batches, cameras, config, ends
@@ -156,7 +156,7 @@ def test_png_colour_without_masks(tmp_path):
 
 
 def test_a_long_scene_has_several_shards(tmp_path, dataset, monkeypatch):
-    monkeypatch.setattr(tar_files, "MAX_SHARD_VIEWS", 2)
+    monkeypatch.setattr(shards, "MAX_SHARD_VIEWS", 2)
     out = tmp_path / "set"
     with exporting(ShardsExporter, out, config()) as exporter:
         exporter.write_constants()

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.codes import MAX_INSTANCES, Status
 from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
-from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.exporters.bop.view import ViewSettings, make_view_task, rotation_matrices
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel

@@ -1,10 +1,11 @@
-"""Files of the format points: a cloud of each view, in the polygon file format (Turk 1994), and a list of the clouds of a scene.
+"""Point clouds: a file a view, in the polygon file format (PLY; Turk 1994), with colour, object and instance of each point, and a list of
+the clouds of a scene; their exporter.
 
-Runs in writer processes, so it imports neither Warp nor Newton.
+Runs in writer processes, too, so it imports neither Warp nor Newton.
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,13 @@ import cv2
 import numpy as np
 
 from synpick_warp.configs.calibration.lens import LensMap, pixel_rays, read_lens
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
-from synpick_warp.exporters.base import EncodedView
+from synpick_warp.exporters.base import EncodedView, SharedFiles
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages
 from synpick_warp.exporters.bop.view import MILLIMETERS, ViewSettings
-from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder, write_synced
+from synpick_warp.exporters.writing.files import Buffer, open_folder, output_errors, sync_folder, write_synced
+from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.system.linear_algebra import is_rotation
 
 FOLDER = Path("points")
@@ -130,3 +134,34 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, split: str, f
         scene.rename(out / FOLDER / split / f"{scene_id:06d}")
     for folder in (FOLDER, FOLDER / split):
         sync_folder(out / folder)
+
+
+class PointsExporter(SceneExporter):
+    """`Exporter` of point clouds. A scene is a folder of clouds in the frame of the world, and a list of them."""
+
+    staging = "points"
+
+    write_view = staticmethod(write_view)
+
+    @staticmethod
+    def folder_name(split: str) -> str:
+        return str(FOLDER / split)
+
+    @staticmethod
+    def shared_files(layout: DataLayout) -> SharedFiles:
+        return SharedFiles(note_files(layout), (), (*(FOLDER / split for split in layout.folders), FOLDER))
+
+    def write_constants(self) -> list[Path]:
+        context = self._context
+        with output_errors(self._out):
+            for folder in reversed(self.shared_files(context.layout).folders):
+                (self._out / folder).mkdir(exist_ok=True)
+            return write_notes(self._out, context.settings, context.names, self._cameras)
+
+    def places(self, episode: int) -> list[Path]:
+        folder, scenes = self._folder(self.scene_ids(episode)[0]).relative_to(self._out), self.scene_ids(episode)
+        return [*map(cloud_list, scenes), *(folder / f"{scene:06d}" for scene in scenes)]
+
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        split = self._context.layout.folder(scenes[0][1] // len(self._cameras))
+        return commit_scenes, (scenes, self._out, split, images)

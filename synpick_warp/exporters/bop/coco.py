@@ -1,6 +1,7 @@
-"""Files of the COCO format: images and annotations of a scene, as views are written, and the annotation file of each split.
+"""COCO instance segmentation: images, one annotation file for each split, with visible boxes, for detectors' training code; its exporter.
 
-Runs in writer processes, so it imports neither Warp nor Newton.
+Beside BOP's scene_gt_coco.json, which is a file a scene with amodal boxes: here boxes enclose the visible mask, as COCO's readers expect.
+Runs in writer processes, too, so it imports neither Warp nor Newton.
 """
 
 import json
@@ -15,11 +16,13 @@ from typing import Any
 import msgspec
 
 from synpick_warp.configs.cell.cameras import Size
-from synpick_warp.configs.dataset import ExportSettings
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
+from synpick_warp.configs.schema import Bop
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.base import EncodedView
+from synpick_warp.exporters.base import EncodedView, SharedFiles
 from synpick_warp.exporters.bop.outlines import trace_outlines
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages
 from synpick_warp.exporters.bop.view import (
     ANNOTATIONS,
     Keypoints,
@@ -31,6 +34,8 @@ from synpick_warp.exporters.bop.view import (
     to_json,
 )
 from synpick_warp.exporters.writing.files import PARTIAL, open_folder, output_errors, sync_folder, write_synced
+from synpick_warp.exporters.writing.notes import note_files, write_notes
+from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.system.inputs.files import MAX_JSON, decode_json, path_inside, read_file, read_json
 
 FOLDER = Path("coco")
@@ -186,3 +191,42 @@ def _describe_image(sizes: tuple[Size, ...], color_format: str, scene: int, fram
     width, height = sizes[camera]
     name = f"{scene:06d}/{frame:06d}.{color_format}"
     return {"file_name": name, "width": width, "height": height, "episode": episode, "camera": camera, "frame": frame}
+
+
+class CocoExporter(SceneExporter):
+    """`Exporter` of COCO. A scene is a folder of images, and a part of the annotations, from which a file a split is made at the end."""
+
+    writes_depth = False
+    staging = "coco"
+
+    write_view = staticmethod(write_view)
+
+    @staticmethod
+    def annotates(bop: Bop) -> bool:
+        return True
+
+    @staticmethod
+    def folder_name(split: str) -> str:
+        return FOLDER.name
+
+    @staticmethod
+    def shared_files(layout: DataLayout) -> SharedFiles:
+        places = tuple(map(annotation_file, layout.folders))
+        return SharedFiles((CATEGORIES, *note_files(layout)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
+
+    @staticmethod
+    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+        with output_errors(out / FOLDER):
+            return write_annotation_files(out, settings, episodes)
+
+    def write_constants(self) -> list[Path]:
+        names = self._context.names
+        write_categories(self._out, names, self._keypoints)
+        with output_errors(self._out):
+            return [CATEGORIES, *write_notes(self._out, self._context.settings, names, self._cameras)]
+
+    def places(self, episode: int) -> Iterator[Path]:
+        return (place for scene in self.scene_ids(episode) for place in (IMAGES / f"{scene:06d}", PARTS / f"{scene:06d}.jsonl"))
+
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        return commit_scenes, (scenes, self._out, images)

@@ -1,1 +1,0 @@
-"""COCO instance segmentation: images, and one annotation file for each split."""

@@ -1,1 +1,0 @@
-"""Point clouds of views."""

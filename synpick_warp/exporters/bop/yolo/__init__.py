@@ -1,1 +1,0 @@
-"""YOLO labels: boxes, oriented boxes and segments of the visible masks."""
