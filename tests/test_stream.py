@@ -20,7 +20,7 @@ from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.host_copies import HostCopy
 from synpick_warp.stages.perception.images import Observation, Plan
-from synpick_warp.stages.render.mask_runs import FIELDS, boundary_sizes
+from synpick_warp.stages.render.annotate import FIELDS, boundary_sizes
 from synpick_warp.stages.render.scene import build_lights
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.sim.simulate import TickRecord

@@ -44,8 +44,7 @@ from synpick_warp.scenes.grippers import check_reach, make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import choose_transfers
-from synpick_warp.stages.render.lamp_variants import load_scene_lights
-from synpick_warp.stages.render.looks import draw_looks
+from synpick_warp.stages.render.looks import draw_looks, load_scene_lights
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene, with_cameras
 from synpick_warp.stages.sim.simulate import Simulation

@@ -37,8 +37,8 @@ from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
-from synpick_warp.stages.render.lamp_variants import load_scene_lights
-from synpick_warp.stages.render.suction_surface import with_suctionable_area
+from synpick_warp.stages.render.layers import with_suctionable_area
+from synpick_warp.stages.render.looks import load_scene_lights
 from synpick_warp.system.hardware.device import describe_kinds, pick_device
 from synpick_warp.system.hardware.kernels import KERNEL_VARIABLE
 from synpick_warp.system.interpreter import duplicate_above_streams, open_standard_descriptors

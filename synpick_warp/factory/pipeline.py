@@ -26,7 +26,7 @@ from synpick_warp.factory.picks import PickQueue
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import limit_threads
-from synpick_warp.stages.render.suction_surface import with_suctionable_area
+from synpick_warp.stages.render.layers import with_suctionable_area
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope

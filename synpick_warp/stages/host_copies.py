@@ -1,6 +1,6 @@
 """Device-to-host copies of a batch's images: which are copied, which are replaced by encoded files or run boundaries, and the copies.
 
-Run boundaries are the positions at which masks change down a column, from which run lengths (RLE) are made; see `mask_runs`.
+Run boundaries are the positions at which masks change down a column, from which run lengths (RLE) are made; see `annotate`.
 """
 
 import time

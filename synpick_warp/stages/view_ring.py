@@ -25,8 +25,8 @@ from synpick_warp.stages import encoding
 from synpick_warp.stages.arrays import allocate, dry_run
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.host_copies import DeviceImages, HostCopy, TransferSettings
+from synpick_warp.stages.render.annotate import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.cameras import allocate_lenses, allocate_view_cameras, place_cameras
-from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.render_streams import RenderStreams

@@ -229,7 +229,7 @@ class StoredContext(ExportContext):
         from synpick_warp.dataset.commit.writing import digest_inputs
         from synpick_warp.scenes.catalog import load_catalog
         from synpick_warp.scenes.looks import load_looks
-        from synpick_warp.stages.render.lamp_variants import load_scene_lights
+        from synpick_warp.stages.render.looks import load_scene_lights
 
         source, config = self._source, self._source.config
         catalog = load_catalog(config)

@@ -1,4 +1,5 @@
-"""Denoised renderer: coarse path pass, variance-guided denoiser, lamp shadows, deferred shading and anti-aliasing.
+"""Denoised renderer: coarse path pass, variance-guided denoiser, lamp shadows, deferred shading and anti-aliasing; and the path-traced
+reference renderer.
 
 Mode unoccluded leaves out the first two: no ambient occlusion, no indirect light.
 """
@@ -29,6 +30,7 @@ from synpick_warp.kernels.render.lighting.paths.light import CoarseLight
 from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS, PathLists
 from synpick_warp.kernels.render.lighting.paths.queues import PATH_RECORDS, QUEUE_CAPACITY, PathQueues
 from synpick_warp.kernels.render.lighting.paths.reuse import reuse_histories_kernel, schedule_paths_kernel
+from synpick_warp.kernels.render.lighting.paths.tracing import COMBINED, PathRules, trace_paths_kernel
 from synpick_warp.kernels.render.lighting.shading import DenoisedLight, shade_kernel, shade_samples_kernel
 from synpick_warp.kernels.render.lighting.shadow_edges import CHUNK_TILES as EDGE_CHUNK_TILES
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows, filter_shadows_kernel, measure_steepness_kernel
@@ -43,7 +45,6 @@ from synpick_warp.stages.arrays import allocate_struct, bundle, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.looks import shade_floor
-from synpick_warp.stages.render.reference import make_path_rules
 from synpick_warp.stages.render.sampling_rates import (
     accumulates,
     coarse_size,
@@ -61,6 +62,39 @@ from synpick_warp.stages.render.sampling_rates import (
 from synpick_warp.stages.render.scene import RenderScene, build_grid
 from synpick_warp.stages.render.view_setup import body_sizes
 from synpick_warp.stages.timing import scope
+
+REFERENCE_ROULETTE = 2
+"""First bounce with Russian roulette: the first bounces carry most of the light."""
+
+
+def make_path_rules(render: Render, seed: int, samples: int, roulette: int) -> Any:
+    """Make the path tracer's parameters: multiple importance sampling (Veach and Guibas, 1995) and no path regularization."""
+    rules = PathRules()
+    rules.samples = rules.first_samples = samples
+    rules.bounces = render.bounces
+    rules.roulette = roulette
+    rules.strategy = int(COMBINED)
+    rules.seed = seed
+    return rules
+
+
+class ReferenceRenderer:
+    """Path tracer for reference images in linear radiance. `shade` only launches kernels."""
+
+    def __init__(self, render: Render, seed: int, scene: RenderScene) -> None:
+        """`render`: render settings: `samples` and `bounces`. `seed`: seed of the data set. `scene`: constant data."""
+        self.scene = scene
+        self.rules = make_path_rules(render, seed, render.samples, REFERENCE_ROULETTE)
+
+    def shade(self, snapshot: Snapshot, shot: Any, image: Any, add: Callable[[Any, Any], None] | None = None) -> None:
+        """Render the radiance of a batch of views; arguments as of `DenoisedRenderer.shade`. It is anti-aliased. Each path traces its own
+        camera ray: the G-buffer is read for the floor alone."""
+        scene, pixels = self.scene, shot.views.count * self.scene.grid.tiles * int(TILE_PIXELS)
+        launch_pixels(trace_paths_kernel, pixels, [scene.paths, shot, self.rules], [image], scene.device)
+        shade_floor(scene, shot, image)
+        if add is not None:
+            add(shot, image)
+
 
 SINGLE_PATH_VARIANCE_SCALE = 2.0
 """Variance multiplier at one path per coarse pixel, where the sample variance underestimates bright small sources: few paths hit them, and

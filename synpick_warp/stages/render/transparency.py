@@ -13,9 +13,8 @@ from synpick_warp.kernels.render.visibility.gbuffer import ALL_PASSES, ShadedIma
 from synpick_warp.stages.arrays import allocate_struct, bundle, struct_arrays
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
-from synpick_warp.stages.render.denoised import DenoisedRenderer
+from synpick_warp.stages.render.denoised import DenoisedRenderer, ReferenceRenderer
 from synpick_warp.stages.render.raster import Rasterizer
-from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import GBUFFER, bin_bodies, body_sizes, make_shot
 

@@ -1,5 +1,7 @@
-"""Per-view setup of a batch: which camera shows which world, camera-space transforms of its bodies, and tile binning."""
+"""Per-view setup of a batch: which camera shows which world, camera-space transforms of its bodies, and tile binning; and props, which are
+bodies appended to the instances of each world, with the segmentation id of the table."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,10 +10,11 @@ import warp as wp
 from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, Views
 from synpick_warp.kernels.render.visibility.damage import Damage
 from synpick_warp.kernels.render.visibility.gbuffer import MASK_BITS, GBuffer, LensShot, ShotData, ViewBodies
+from synpick_warp.kernels.render.visibility.props import hide_props_kernel, place_props_kernel
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.render.visibility.view_setup import aim_cameras_kernel, bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
-from synpick_warp.stages.arrays import allocate_struct, struct_arrays
+from synpick_warp.stages.arrays import allocate, allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.cameras import allocate_view_cameras
 from synpick_warp.stages.render.scene import RenderScene, build_grid
@@ -117,3 +120,50 @@ def bin_bodies(scene: RenderScene, views: Any, bodies: Any) -> None:
     wp.launch(
         kernel_for(bin_bodies_kernel, views), dim=(views.count, scene.grid.tiles), inputs=inputs, outputs=[bodies], device=scene.device
     )
+
+
+PLACED = ("catalog_index", "pose", "last_catalog_index", "last_pose")
+"""Arrays of a snapshot to which props are appended."""
+
+
+def allocate_placed(worlds: int, instances: int, props: int, device: wp.Device) -> Snapshot | None:
+    """Allocate the arrays of a snapshot with props; None: there are none."""
+    return allocate(Snapshot, {"world": worlds, "instance": instances + props}, device, PLACED) if props else None
+
+
+class PropPlacer:
+    """Appends a scene's props to the instances of snapshots and views, and returns these unchanged in a scene without props. Allocates its
+    scratch for the number of worlds of the first snapshot.
+
+    Attributes:
+        bodies: Number of instances and props of a world.
+    """
+
+    def __init__(self, scene: RenderScene, instances: int) -> None:
+        """Create a placer. `scene`: has the props. `instances`: instance capacity of a world."""
+        self.scene, self.instances, self.bodies = scene, instances, instances + scene.prop_count
+        self._placed: Snapshot | None = None
+
+    def place(self, snapshot: Snapshot, fixture_visible: wp.array) -> Snapshot:
+        """Copy of a snapshot with props as instances. `fixture_visible`: as of `set_up_views`; hidden grippers hide what follows them."""
+        if not self.scene.prop_count:
+            return snapshot
+        device, worlds = self.scene.device, snapshot.pose.shape[0]
+        if self._placed is None or self._placed.pose.shape[0] != worlds:
+            self._placed = allocate_placed(worlds, self.instances, self.scene.prop_count, device)
+        placed = replace(snapshot, **{name: getattr(self._placed, name) for name in PLACED})
+        inputs = [self.scene.props, fixture_visible, snapshot.bundle]
+        wp.launch(place_props_kernel, dim=placed.pose.shape, inputs=inputs, outputs=[placed.bundle], device=device)
+        return placed
+
+    def widen(self, views: Any) -> Any:
+        """Copy the struct `Views` or `LensViews`, with the props counted among the instances."""
+        if not self.scene.prop_count:
+            return views
+        return make_views(views.world, views.camera, views.count, self.bodies, views.cameras, views.slot)
+
+    def hide(self, segment: wp.array, views: int) -> None:
+        """Replace the ids of props by the table's in the first `views` segmentation images (view, row, column)."""
+        if self.scene.prop_count:
+            dim = (views, *segment.shape[1:])
+            wp.launch(hide_props_kernel, dim=dim, inputs=[self.instances], outputs=[segment], device=self.scene.device)

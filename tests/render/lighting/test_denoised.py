@@ -13,7 +13,7 @@ from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.lighting.paths.tracing import BRDF_SAMPLING, LIGHT_SAMPLING
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import allocate_view_buffers
-from synpick_warp.stages.render import reference
+from synpick_warp.stages.render import denoised
 from synpick_warp.stages.render.denoised import history_sizes, scratch_sizes
 from synpick_warp.stages.render.light_tables import measure_albedo, precompute_environment
 from synpick_warp.stages.render.scene import build_render_scene
@@ -173,7 +173,7 @@ def test_russian_roulette_is_unbiased(device, monkeypatch):
     view = camera(8, 24, 200.0, (0.0, 0.0, 2.0))
     means = []
     for roulette in (0, 2, 100):
-        monkeypatch.setattr(reference, "ROULETTE", roulette)
+        monkeypatch.setattr(denoised, "REFERENCE_ROULETTE", roulette)
         radiance = trace_objects(device, (sheet(0.3, 0.3), grey), *walls, samples=1024, bounces=16, view=view).radiance
         # Between the walls, where light arrives after several bounces.
         means.append(radiance[0, 4:20, 3:5].mean())
@@ -192,7 +192,7 @@ def test_sampling_strategies_have_the_same_mean(device, monkeypatch):
     combined = trace_objects(device, *objects, lights=lights, samples=64, light_yaw=0.7).radiance[0]
     noise = {}
     for strategy in (LIGHT_SAMPLING, BRDF_SAMPLING):
-        monkeypatch.setattr(reference, "COMBINED", strategy)
+        monkeypatch.setattr(denoised, "COMBINED", strategy)
         alone = trace_objects(device, *objects, lights=lights, samples=128, light_yaw=0.7).radiance[0]
         np.testing.assert_allclose(alone.mean(axis=(0, 1)), combined.mean(axis=(0, 1)), rtol=0.01)
         noise[strategy] = np.abs(alone - combined).mean()

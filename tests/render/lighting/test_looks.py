@@ -19,9 +19,8 @@ from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import EnvironmentMap, Fixture
 from synpick_warp.stages import launch
-from synpick_warp.stages.render.lamp_variants import add_lamps, black_body_color, load_scene_lights
 from synpick_warp.stages.render.light_tables import precompute_environment, prefilter_specular, sh_basis
-from synpick_warp.stages.render.looks import draw_looks
+from synpick_warp.stages.render.looks import add_lamps, black_body_color, draw_looks, load_scene_lights
 from synpick_warp.stages.render.scene import mip_levels, uv_density
 from synpick_warp.stages.render.view_setup import make_views
 from tests.builders import STIRRING, bake_boxes

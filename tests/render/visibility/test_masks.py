@@ -23,8 +23,8 @@ from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import ViewBuffers, allocate_view_buffers, masks_of, view_buffer_sizes
 from synpick_warp.stages.online.batches import TruthBuffers
-from synpick_warp.stages.render import mask_runs
-from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
+from synpick_warp.stages.render import annotate
+from synpick_warp.stages.render.annotate import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport
 from synpick_warp.stages.view_ring import SHARE, CameraGroup, MaskBounds, ViewRing, share_words, split_batches, widen
@@ -236,7 +236,7 @@ def test_device_lists_the_same_boundaries_as_numpy(device, shape):
 def test_boundaries_beyond_the_capacity_are_counted(device, monkeypatch):
     ids, masks = sample_blocks(14, 11)
     complete = list_on_device(ids, masks[:, :9], device)
-    monkeypatch.setattr(mask_runs, "BOUNDARIES_PER_COLUMN", 1)
+    monkeypatch.setattr(annotate, "BOUNDARIES_PER_COLUMN", 1)
     cut = list_on_device(ids, masks[:, :9], device)
     for name in ("boundary_count", "run_count"):
         np.testing.assert_array_equal(getattr(cut, name).numpy(), getattr(complete, name).numpy())
