@@ -15,7 +15,6 @@ from synpick_warp.kernels.structs import ModeData
 from synpick_warp.stages.arrays import Row, StructArrays, allocate, allocate_struct, array_group, device_array, dry_run, struct_arrays
 from synpick_warp.stages.buffers import view_buffer_sizes
 from synpick_warp.stages.constants import fill
-from synpick_warp.stages.host_copies import TransferSettings
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.online.batches import allocate_slot
 from synpick_warp.stages.perception.images import allocate_batch, count_views
@@ -28,7 +27,7 @@ from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import allocate_worlds
 from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
 from synpick_warp.stages.sim.worlds import world_sizes
-from synpick_warp.stages.view_ring import RING, allocate_ring
+from synpick_warp.stages.view_ring import RING, TransferSettings, allocate_ring
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.memory_tables import device_arrays, queued_ticks
 from tests.worlds.small_worlds import settings

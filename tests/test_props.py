@@ -10,8 +10,8 @@ import trimesh
 from pxr import Usd, UsdGeom, UsdPhysics
 
 from synpick_warp.codes import Segment
+from synpick_warp.configs.cell.bins import EMBEDDED, PropRow
 from synpick_warp.configs.cell.cameras import GRIPPER, Pose
-from synpick_warp.configs.cell.props import EMBEDDED, PropRow
 from synpick_warp.configs.episodes.randomize import Distribution, Randomize
 from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.configs.schema import UNOCCLUDED

@@ -15,17 +15,16 @@ from synpick_warp.codes import MAX_INSTANCES, Effect, Measure, Phase, Status
 from synpick_warp.configs.cell.cameras import CameraRow
 from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
-from synpick_warp.stages import host_copies, view_ring
+from synpick_warp.stages import view_ring
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, view_buffer_sizes
-from synpick_warp.stages.host_copies import HostCopy
 from synpick_warp.stages.perception.images import Observation, Plan
 from synpick_warp.stages.render.annotate import FIELDS, boundary_sizes
 from synpick_warp.stages.render.scene import build_lights
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, read_tick, tick_batch
-from synpick_warp.stages.view_ring import CameraGroup, ViewRing, view_sizes, views_per_batch
+from synpick_warp.stages.view_ring import CameraGroup, HostCopy, ViewRing, view_sizes, views_per_batch
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.frames import FrameBatch, SelectedRows
 from tests.twins.encodings import encode_depth
@@ -81,7 +80,7 @@ def sizes_of(config: Config, device: wp.Device) -> dict[str, int]:
     return view_sizes(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
 
 
-def frame_stream(config: Config, renderer: FakeRenderer, device, host: host_copies.TransferSettings | None = None) -> FrameStream:
+def frame_stream(config: Config, renderer: FakeRenderer, device, host: view_ring.TransferSettings | None = None) -> FrameStream:
     group = CameraGroup(config.rig.groups[0], sizes_of(config, device), renderer)  # type: ignore[arg-type]
     return FrameStream([ViewRing(group, config.render.layers, device, host)], config.physics.tick_time, OBJECT_IDS, LIGHTS, device)
 
@@ -333,7 +332,7 @@ def test_run_boundaries_are_those_of_the_batchs_own_images(device):
 def test_files_and_lists_stand_for_images(device):
     """JPEG and depth files equal the encoded images; images that stay on the device are copied on demand, one at a time."""
     renderer, config = FakeRenderer([]), config_of(render__views_per_batch=4)
-    host = host_copies.TransferSettings(("color", "depth", "instance", "mask_words"), 90, depth_files=True)
+    host = view_ring.TransferSettings(("color", "depth", "instance", "mask_words"), 90, depth_files=True)
     frames = frame_stream(config, renderer, device, host)
     code = iter([11, 12, 13, 41, 42, 43])
     for batch in frames.render("snapshot", report_of([0, 1, 0, 0, 1])):  # type: ignore[arg-type]
@@ -352,29 +351,29 @@ def test_files_and_lists_stand_for_images(device):
 @pytest.mark.parametrize(
     ("cuda", "needs_images", "settings_", "expected"),
     [
-        (False, False, {}, host_copies.TransferSettings(depth_files=True)),
-        (True, True, {}, host_copies.TransferSettings(("mask_words",), depth_files=True)),
-        (True, True, {"cameras__resolution": [300, 287]}, host_copies.TransferSettings(depth_files=True)),
+        (False, False, {}, view_ring.TransferSettings(depth_files=True)),
+        (True, True, {}, view_ring.TransferSettings(("mask_words",), depth_files=True)),
+        (True, True, {"cameras__resolution": [300, 287]}, view_ring.TransferSettings(depth_files=True)),
         (
             True,
             False,
             {"bop__split": "train_pbr", "bop__color_format": "jpg", "bop__jpeg_quality": 90},
-            host_copies.TransferSettings(("depth", "color", "instance", "mask_words"), 90, True),
+            view_ring.TransferSettings(("depth", "color", "instance", "mask_words"), 90, True),
         ),
-        (True, False, {"bop__color_format": "png"}, host_copies.TransferSettings(("depth", "instance", "mask_words"), depth_files=True)),
-        (True, False, {"cameras__resolution": [300, 287]}, host_copies.TransferSettings(("depth",), depth_files=True)),
+        (True, False, {"bop__color_format": "png"}, view_ring.TransferSettings(("depth", "instance", "mask_words"), depth_files=True)),
+        (True, False, {"cameras__resolution": [300, 287]}, view_ring.TransferSettings(("depth",), depth_files=True)),
     ],
 )
 def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
     config = settings(**({"cameras__resolution": [640, 360]} | settings_))
-    assert host_copies.choose_transfers(config.bop, config.rig.largest[1], SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
+    assert view_ring.choose_transfers(config.bop, config.rig.largest[1], SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("objects", [1, 24, MAX_INSTANCES])
 def test_the_largest_lists_are_no_larger_than_images(objects):
     one, columns = np.dtype(np.uint32).itemsize * FIELDS, 7
-    sizes = boundary_sizes(view_buffer_sizes(1, columns, host_copies.MIN_LISTED_ROWS, objects))
-    assert one * sizes["boundary"] <= host_copies.MIN_LISTED_ROWS * columns
+    sizes = boundary_sizes(view_buffer_sizes(1, columns, view_ring.MIN_LISTED_ROWS, objects))
+    assert one * sizes["boundary"] <= view_ring.MIN_LISTED_ROWS * columns
 
 
 def test_groups_of_cameras_take_turns_in_a_tick(device):
@@ -451,11 +450,11 @@ def copy_after(queries: int) -> HostCopy:
 def test_a_wait_pauses_until_the_copy_is_done(monkeypatch, queries, pauses):
     synchronized, slept = [], []
     monkeypatch.setattr(wp, "synchronize_event", synchronized.append)
-    monkeypatch.setattr(host_copies.time, "sleep", slept.append)
-    monkeypatch.setattr(host_copies.time, "monotonic", lambda: 7.0)
+    monkeypatch.setattr(view_ring.time, "sleep", slept.append)
+    monkeypatch.setattr(view_ring.time, "monotonic", lambda: 7.0)
     copy = copy_after(queries)
     assert copy.wait()[0].tolist() == [0.0]
-    assert slept == [host_copies.PAUSE_SECONDS] * pauses
+    assert slept == [view_ring.PAUSE_SECONDS] * pauses
     assert synchronized == [copy.done]
 
 
@@ -464,6 +463,6 @@ def test_a_failed_copy_is_reported_though_its_event_is_never_complete(monkeypatc
         raise RuntimeError("Failed to synchronize event")
 
     monkeypatch.setattr(wp, "synchronize_event", fail)
-    monkeypatch.setattr(host_copies, "MAX_PAUSED_SECONDS", 0.01)
+    monkeypatch.setattr(view_ring, "MAX_PAUSED_SECONDS", 0.01)
     with pytest.raises(RuntimeError, match="Failed"):
         copy_after(10**9).wait()

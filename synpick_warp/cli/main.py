@@ -240,7 +240,7 @@ def warmup(
     resolved = _resolve(config, given, resolution, set_)
     _check_inputs(resolved.bake.models, resolved.bake.lights)
     from synpick_warp.cli.display import make_console, make_progress
-    from synpick_warp.factory.warmup import check_caches, warm_up
+    from synpick_warp.factory.assembly import check_caches, warm_up
 
     check_caches()
 

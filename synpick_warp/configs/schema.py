@@ -10,10 +10,9 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 from synpick_warp.codes import MAX_INSTANCES, Tone, names
-from synpick_warp.configs.cell.bins import BinRow, Bins, Cell, Tote
+from synpick_warp.configs.cell.bins import BinRow, Bins, Cell, PropRow, Tote
 from synpick_warp.configs.cell.cameras import CameraRow, Cameras, DepthSensor, Effects, Rig, Still
 from synpick_warp.configs.cell.gripper import Gripper, Suction
-from synpick_warp.configs.cell.props import PropRow
 from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, Picks, Target
 from synpick_warp.configs.episodes.objects import COUNTS, Counts, ObjectRow, Objects, parse_counts
 from synpick_warp.configs.episodes.randomize import Randomize

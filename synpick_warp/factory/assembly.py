@@ -1,11 +1,12 @@
 """Composition root: factory functions that build the stages of a bake (simulated worlds, renderer, encoders), load its assets, and compile
-its kernels ahead of time, in parallel threads.
+its kernels ahead of time, in parallel threads; and the warm-up, which compiles all kernels that a bake or stream launches.
 
 A bake generates a data set. Callers (bake, online stream, warm-up) pass the whole `Config`; stages take the sections that they need.
 """
 
 import contextlib
 import gc
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ from synpick_warp.factory.episodes import PLACES, EpisodeOutcome, count_writers
 from synpick_warp.factory.forecast import order_longest_first
 from synpick_warp.factory.memory_plan import check_memory, explain_shortage, fit_to_device, plan_memory, without_pictures
 from synpick_warp.factory.picks import PickEngine, PickQueue
+from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
 from synpick_warp.kernels.render.lighting.brdf import measure_albedo_kernel
 from synpick_warp.kernels.render.lighting.paths.coarse import trace_coarse_paths_kernel
 from synpick_warp.kernels.render.lighting.shading import shade_kernel
@@ -40,16 +42,17 @@ from synpick_warp.scenes.build import REPEATS, find_drawn, find_repeat_rules, mu
 from synpick_warp.scenes.cameras import EpisodeCameras, describe_cameras
 from synpick_warp.scenes.capacities import FEW, check_fill, with_capacities
 from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.scenes.grippers import check_reach, make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
-from synpick_warp.stages.host_copies import choose_transfers
 from synpick_warp.stages.render.looks import draw_looks, load_scene_lights
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene, with_cameras
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, read_tick
-from synpick_warp.stages.view_ring import CameraGroup, MaskBounds, ViewRing, history_count, view_sizes
+from synpick_warp.stages.view_ring import CameraGroup, MaskBounds, ViewRing, choose_transfers, history_count, view_sizes
+from synpick_warp.system.hardware import kernels
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.kernels import Compiler, build_of, compilation_lock, dry_launches
 from synpick_warp.system.interpreter import collection_paused
@@ -387,3 +390,50 @@ def make_renderer(
         **given,
         shutter=(shutter[0] / config.physics.tick_time, shutter[1] / config.physics.tick_time),
     )
+
+
+@dataclass(frozen=True)
+class WarmUp:
+    """Result of a warm-up."""
+
+    compiled: int
+    """Number of modules that were compiled; the others were in the cache, or are shipped."""
+    seconds: float
+    """Duration [s]."""
+
+
+def check_caches() -> None:
+    """Raise CacheError unless kernels and collision shapes can be kept: a warm-up into a temporary cache is lost at its end."""
+    caches = (
+        ("kernel", kernels.kernel_cache(wp.config.version), kernels.KERNEL_VARIABLE),
+        ("shape", default_cache_dir() if kernels.user_cache() else None, kernels.USER_VARIABLE),
+    )
+    for name, folder, variable in caches:
+        reason = "the user has no home" if folder is None else kernels.find_fault(folder)
+        if reason is not None:
+            raise kernels.CacheError(
+                f"the {name} cache {folder or '~/.cache'} cannot be written ({reason}), so that a warm-up would be lost; "
+                f"set {variable} to a folder that can be written"
+            )
+
+
+def warm_up(config: Config, progress: Progress) -> WarmUp:
+    """Compile the kernels of a bake or stream with these settings, then run two ticks and one rendering in the fewest worlds of the device;
+    errors as of `synpick_warp.bake`.
+
+    Nothing is written but caches, of kernels and collision shapes. Kernels depend on the settings only by which of them are
+    used (mode, renderer, layers, formats)."""
+    started = time.perf_counter()
+    needs = Needs.of(config)
+    device = pick_device(config.bake.device)
+    with sole_compiler(progress):
+        take_shipped(device)
+        before = kernels.list_binaries()
+        with make_compiler(device, progress) as compiler:
+            submit_slow(compiler, device, config)
+            compiler.submit([kernels.build_of(gather_cameras_kernel, device)])  # The one module that only the online stream needs.
+            factory = build_smallest(config, device, progress)
+            stream = factory.stream if needs.views else None
+            submit_launches(compiler, factory.simulation, stream)
+        launch_all(factory.simulation, stream)
+    return WarmUp(len(kernels.list_binaries() - before), time.perf_counter() - started)

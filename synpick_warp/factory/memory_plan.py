@@ -36,7 +36,6 @@ from synpick_warp.scenes.grippers import make_head
 from synpick_warp.scenes.props import make_props
 from synpick_warp.stages.arrays import DryArray, Row, dry_run
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.host_copies import TransferSettings, choose_transfers
 from synpick_warp.stages.online.batches import allocate_slot
 from synpick_warp.stages.perception.images import allocate_batch, count_views
 from synpick_warp.stages.perception.perceive import allocate_votes
@@ -53,7 +52,15 @@ from synpick_warp.stages.sim.trials import count_trial_worlds
 from synpick_warp.stages.sim.worlds import world_sizes
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.ticks import allocate_rings, queue_lead, record_bytes
-from synpick_warp.stages.view_ring import RING, allocate_ring, history_count, view_sizes, views_per_batch
+from synpick_warp.stages.view_ring import (
+    RING,
+    TransferSettings,
+    allocate_ring,
+    choose_transfers,
+    history_count,
+    view_sizes,
+    views_per_batch,
+)
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.device import ALL, pick_device, pick_devices
 from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from synpick_warp.configs.cell.bins import BinSizes
+from synpick_warp.configs.cell.bins import EMBEDDED, BinSizes, PropRow
 from synpick_warp.configs.cell.cameras import GRIPPER, in_opencv_axes
-from synpick_warp.configs.cell.props import EMBEDDED, PropRow
 from synpick_warp.errors import CatalogError, ConfigError, suggest
 from synpick_warp.scenes.assets.asset_files import ignore
 from synpick_warp.scenes.assets.meshes import SUFFIXES, connected_parts, merge_positions, read_cell_mesh, read_measured

@@ -12,12 +12,11 @@ import warp as wp
 from synpick_warp.codes import SHAFT, Measure, Status, column_names
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.host_copies import HostCopy
 from synpick_warp.stages.render.view_setup import pair_views
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
-from synpick_warp.stages.view_ring import CameraGroup, ViewExtrinsics, ViewRing, split_batches
+from synpick_warp.stages.view_ring import CameraGroup, HostCopy, ViewExtrinsics, ViewRing, split_batches
 from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch, most_words
 
 OWN_ARRAYS = 6

@@ -14,12 +14,12 @@ import warp as wp
 from synpick_warp.codes import Phase
 from synpick_warp.stages.arrays import allocate_like
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.host_copies import wait_event
 from synpick_warp.stages.sim.physics import ENDED
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.sim.step_log import record_arrays
 from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.stages.timing import scope
+from synpick_warp.stages.view_ring import wait_event
 from synpick_warp.system.hardware.device import HIGH_PRIORITY, count_reserved
 from synpick_warp.system.interpreter import collection_paused
 

@@ -18,7 +18,7 @@ import warp as wp
 
 from synpick_warp.codes import Phase, Status, column_names
 from synpick_warp.factory import memory_plan
-from synpick_warp.stages import host_copies, ticks
+from synpick_warp.stages import ticks, view_ring
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.perception.images import Observation, Plan
@@ -198,7 +198,7 @@ class ModelReader:
     """`TickReader` of a record whose only reported array is a pair: the tick's number, and the phases of the worlds."""
 
     def __init__(self, record: SimpleNamespace, target: list[ModelArray]) -> None:
-        self.copy = host_copies.HostCopy(self.reported(record), target)
+        self.copy = view_ring.HostCopy(self.reported(record), target)
 
     @staticmethod
     def reported(record: SimpleNamespace) -> list[Any]:
@@ -246,11 +246,11 @@ def make_device(monkeypatch) -> Callable[[int], ModelDevice]:
 
     def make(seed: int) -> ModelDevice:
         device = ModelDevice(random.Random(seed))
-        clock = itertools.count(step=host_copies.PAUSE_SECONDS)
+        clock = itertools.count(step=view_ring.PAUSE_SECONDS)
         time = SimpleNamespace(sleep=lambda _: device.run(device.chance.choice((0, 1, 3, 30))), monotonic=lambda: next(clock))
-        for module in (ticks, host_copies):
+        for module in (ticks, view_ring):
             monkeypatch.setattr(module, "wp", device.wp)
-        monkeypatch.setattr(host_copies, "time", time)
+        monkeypatch.setattr(view_ring, "time", time)
         monkeypatch.setattr(ticks, "TickReader", ModelReader)
         monkeypatch.setattr(ticks, "allocate_slots", partial(allocate_slots, device))
         return device
@@ -349,7 +349,7 @@ def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(make_dev
     """Otherwise a GPU would be idle from the end of each tick until the host asks for the next one."""
     device = make_device(0)
     simulation = ModelSimulation(device, [20], 0, 2 * ticks.PARTS_IN_FLIGHT + 3)
-    host_copies.time.sleep = lambda _: device.run(1)
+    view_ring.time.sleep = lambda _: device.run(1)
     with ticks.TickLoop(simulation, lead) as loop:
         for tick in range(15):
             loop.advance()
@@ -364,7 +364,7 @@ def test_physics_gets_a_share_of_the_device_while_the_renderer_waits_or_the_lead
     """First physics is the bottleneck: the device executes nothing until the host waits. Then it executes all work between two ticks."""
     monkeypatch.setattr(ticks, "SAFE_LEAD", safe_lead)
     device = make_device(0)
-    host_copies.time.sleep = lambda _: device.run(1)
+    view_ring.time.sleep = lambda _: device.run(1)
     simulation = ModelSimulation(device, [2000], waiting, 5)
     with ticks.TickLoop(simulation, max_lead) as loop:
         for _ in range(5):
@@ -402,7 +402,7 @@ def test_the_solver_is_restricted_to_reserved_multiprocessors_if_few_worlds_are_
     """A GPU with 11 multiprocessors reserves 2, for 8 worlds each; a third of the worlds is idle."""
     device = make_device(0)
     device.sm_count = 11
-    host_copies.time.sleep = lambda _: device.run(1)
+    view_ring.time.sleep = lambda _: device.run(1)
     simulation = ModelSimulation(device, [50] * busy + [0] * (busy // 2), 0, 2)
     simulation.physics = SimpleNamespace(solver_stream=None)
     with ticks.TickLoop(simulation, 10) as loop:

@@ -24,7 +24,7 @@ from synpick_warp.cli.main import main
 from synpick_warp.configs.cell.cameras import CameraRow, Pose
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DeviceError
-from synpick_warp.factory import assembly, warmup
+from synpick_warp.factory import assembly
 from synpick_warp.factory.assembly import launch_all, make_compiler
 from synpick_warp.kernels.rng import uniform
 from synpick_warp.newton_patches.narrow_phase import SHIPPED, slow_builds
@@ -406,7 +406,7 @@ def test_a_warm_up_loads_the_kernels_of_all_stages(monkeypatch):
         return launch(kernel, *arguments, **options)
 
     monkeypatch.setattr(wp, "launch", record)
-    result = warmup.warm_up(TINY, SilentProgress())
+    result = assembly.warm_up(TINY, SilentProgress())
     rooms = {name.split(".")[2] for name in loaded if name.startswith("synpick_warp.kernels.")}
     assert rooms >= {"sim", "perception", "render", "encoding"}
     assert result.compiled >= 0
@@ -416,7 +416,7 @@ def test_a_warm_up_loads_the_kernels_of_all_stages(monkeypatch):
 def test_a_warm_up_compiles_what_only_a_stream_launches(monkeypatch):
     submitted = []
     monkeypatch.setattr(Compiler, "submit", lambda compiler, builds: submitted.append([build.module.name for build in builds]))
-    warmup.warm_up(settings(cameras__resolution=[32, 18]), SilentProgress())
+    assembly.warm_up(settings(cameras__resolution=[32, 18]), SilentProgress())
     _, only_stream, others = submitted
     assert only_stream == ["synpick_warp.kernels.render.images.ground_truth"]
     assert not set(only_stream) & set(others)
@@ -470,7 +470,7 @@ def test_a_cold_start_says_how_many_modules_it_compiles(monkeypatch):
 
 
 def test_the_command_says_what_it_did(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(warmup, "warm_up", lambda config, progress: warmup.WarmUp(3, 1.25))
+    monkeypatch.setattr(assembly, "warm_up", lambda config, progress: assembly.WarmUp(3, 1.25))
     monkeypatch.chdir(tmp_path)
     assert main(["warmup", "--config", "smoke", "--device", "cpu"]) == 0
     assert capsys.readouterr().out == "ready in 1.2 s: 3 modules compiled, the others were in the kernel cache\n"
@@ -480,7 +480,7 @@ def test_the_command_says_what_it_did(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(("variable", "name"), [("WARP_CACHE_PATH", "kernel"), ("XDG_CACHE_HOME", "shape")])
 def test_a_cache_that_cannot_be_written_is_a_mistake(tmp_path, monkeypatch, variable, name):
     """The kernels went into a temporary folder, which was removed, with exit code 0."""
-    monkeypatch.setattr(warmup, "warm_up", lambda config, progress: pytest.fail("it compiles"))
+    monkeypatch.setattr(assembly, "warm_up", lambda config, progress: pytest.fail("it compiles"))
     monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "kernels"))
     (tmp_path / "file").touch()
     monkeypatch.setenv(variable, str(tmp_path / "file" / "cache"))

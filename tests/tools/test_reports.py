@@ -18,8 +18,7 @@ from tools.bench import __main__ as bench
 from tools.bench import peers, worlds
 from tools.compare import __main__ as compare
 from tools.compare import pictures
-from tools.reports.real.frames import read_frames
-from tools.reports.real.twins import render_frames
+from tools.reports.real.frames import read_frames, render_frames
 
 PICKS = {key: value for key, value in PICKING.items() if key.startswith(("perception.", "pick."))}
 SHORT_PICKS = (*FEW_STEPS, *assignments(PICKS | {"pick.speed": 4.0, "pick.lift_speed": 2.0, "settle.rest_displacement": 1e-3}))

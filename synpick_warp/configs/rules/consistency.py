@@ -8,10 +8,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from synpick_warp.codes import MAX_INSTANCES
-from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, BinSizes, Tote
+from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, BinSizes, PropRow, Tote
 from synpick_warp.configs.cell.cameras import GRIPPER
 from synpick_warp.configs.cell.gripper import Gripper, find_gripper_conflicts
-from synpick_warp.configs.cell.props import PropRow
 from synpick_warp.configs.dataset import MAX_SHARD_SCENES, DataLayout, bake_modes, may_pick, possible_modes
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.episodes.objects import EMBEDDED, most_objects

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from synpick_warp.configs.cell.props import CONVEYOR
+from synpick_warp.configs.cell.bins import CONVEYOR
 from synpick_warp.scenes.modelling import Patch, Rect, at_height, block, ellipse, face, join, loft, make_mesh, solid
 from synpick_warp.scenes.types import MAP_CENTER, Material, TriangleMesh
 

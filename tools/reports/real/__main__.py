@@ -37,8 +37,7 @@ from synpick_warp.online.dataset import StreamDataset
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run, write_run
 from tools.options import MeasuredRow, configure, existing_folder, fail, make_parser, number_in, positive_count, print_rows
-from tools.reports.real.frames import RealFrame, read_frames
-from tools.reports.real.twins import render_frames
+from tools.reports.real.frames import RealFrame, read_frames, render_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
 """Episodes to train on, and to measure on."""
