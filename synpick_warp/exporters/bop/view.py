@@ -22,17 +22,9 @@ from synpick_warp.codes import Effect, names
 from synpick_warp.configs.calibration.lens import LensMap, read_lens
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import PIXEL_BYTES, EncodedView, StoredScene
+from synpick_warp.exporters.writing import rle
 from synpick_warp.exporters.writing.files import Buffer
 from synpick_warp.exporters.writing.png import encode_png, frame_depth_png
-from synpick_warp.exporters.writing.rle import (
-    Masks,
-    Runs,
-    cached_by_runs,
-    find_run_boundaries,
-    find_runs,
-    split_listed_runs,
-    unpack_run_boundaries,
-)
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.system.linear_algebra import matmul
@@ -251,7 +243,7 @@ class RenderedView:
             raise ValueError("OpenCV cannot decode a depth image; this is an error of synpick-warp, please report it")
         return image
 
-    def masks(self) -> list[Masks]:
+    def masks(self) -> list[rle.Masks]:
         return extract_masks(self._visible, self._amodal, self._truth, self._settings.resolution[1])
 
 
@@ -377,16 +369,20 @@ def _crop_to_boxes(boxes: np.ndarray, height: int, width: int) -> tuple[slice, s
     return slice(top, max(top, bottom)), slice(left, max(left, right))
 
 
-def extract_masks(visible_source: np.ndarray, amodal_source: np.ndarray, truth: ViewTruth, height: int) -> list[Masks]:
+def extract_masks(visible_source: np.ndarray, amodal_source: np.ndarray, truth: ViewTruth, height: int) -> list[rle.Masks]:
     """Extract the masks of all instances, in their order, from the two mask sources of `make_view_task`."""
     instances = truth.instance_id.tolist()
-    ids = unpack_run_boundaries(visible_source, height) if truth.listed else find_run_boundaries(visible_source, truth.top, truth.left)
+    ids = (
+        rle.unpack_run_boundaries(visible_source, height)
+        if truth.listed
+        else rle.find_run_boundaries(visible_source, truth.top, truth.left)
+    )
     if truth.run_count.size:
-        amodal = split_listed_runs(amodal_source, truth.run_count, height, instances)
+        amodal = rle.split_listed_runs(amodal_source, truth.run_count, height, instances)
     else:
         parts = zip(truth.mask_first.tolist(), truth.mask_box, strict=True)
-        amodal = [find_runs(unpack_mask(amodal_source, first, box), box[1], box[0]) for first, box in parts]
-    return [Masks(*pair) for pair in zip(amodal, ids.split_by_value(instances), strict=True)]
+        amodal = [rle.find_runs(unpack_mask(amodal_source, first, box), box[1], box[0]) for first, box in parts]
+    return [rle.Masks(*pair) for pair in zip(amodal, ids.split_by_value(instances), strict=True)]
 
 
 def annotation_block(frame: int, entries: Iterable[bytes]) -> bytes:
@@ -452,12 +448,12 @@ def make_keypoints(view: EncodedView, keypoints: Mapping[int, Keypoints]) -> lis
     return project_keypoints(view.gt, view.camera, view.depth_image(), keypoints)
 
 
-def make_rle(runs: Runs, height: int, width: int) -> orjson.Fragment:
+def make_rle(runs: rle.Runs, height: int, width: int) -> orjson.Fragment:
     """Mask in COCO's uncompressed run-length encoding, which BOP uses as well, for `to_json`."""
     return orjson.Fragment(_format_rle(runs, height, width))
 
 
-@cached_by_runs
-def _format_rle(runs: Runs, height: int, width: int) -> bytes:
+@rle.cached_by_runs
+def _format_rle(runs: rle.Runs, height: int, width: int) -> bytes:
     """JSON of a mask's run lengths."""
     return to_json({"counts": runs.counts(height, width), "size": [height, width]})

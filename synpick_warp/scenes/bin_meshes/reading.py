@@ -12,18 +12,8 @@ from synpick_warp.configs.cell.bins import AXES, BOX, FILE, BinRow, MeasuredBin
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import NO_MATERIAL, FileMaterial
 from synpick_warp.scenes.assets.meshes import read_cell_mesh, read_measured
+from synpick_warp.scenes.bin_meshes import compartments
 from synpick_warp.scenes.bin_meshes.colliders import make_box, make_colliders
-from synpick_warp.scenes.bin_meshes.compartments import (
-    MIN_SIDE,
-    Compartment,
-    Rectangle,
-    enclose,
-    find_compartments,
-    find_holes,
-    find_opening,
-    find_turn,
-    turned,
-)
 from synpick_warp.scenes.bin_meshes.inside import MIN_DEPTH, BinSurface, HeightField, find_inside, make_limits
 from synpick_warp.scenes.types import BLACK, PLAIN, ConvexPiece, Material, TriangleMesh
 from synpick_warp.system.linear_algebra import matmul
@@ -75,26 +65,26 @@ def _model(row: BinRow) -> BinModel:
     unit, up = row.unit or "m", row.up or "z"
     mesh, material, _ = read_cell_mesh(str(path), unit, SIDES, LIKELY_SIDES, "unit", lines.append)
     mesh = _rotate(mesh, lambda vectors: matmul(vectors, _rotation(up).astype(np.float32).T))
-    yaw = find_turn(mesh.vertices[mesh.faces].astype(np.float64))
-    mesh = _rotate(mesh, lambda vectors: turned(vectors.astype(np.float64), -yaw).astype(np.float32)) if yaw else mesh
+    yaw = compartments.find_turn(mesh.vertices[mesh.faces].astype(np.float64))
+    mesh = _rotate(mesh, lambda vectors: compartments.turned(vectors.astype(np.float64), -yaw).astype(np.float32)) if yaw else mesh
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     surface = find_inside(corners)
-    places = find_compartments(surface) if surface else []
+    places = compartments.find_compartments(surface) if surface else []
     if surface is None or not places:
         raise CatalogError(f"{path} has no inside {_explain(corners, up)}")
-    low, high = find_opening(surface, places)
+    low, high = compartments.find_opening(surface, places)
     origin = np.array([*((low + high) / 2.0), surface.floor])
-    holes, leans = find_holes(surface), any(one.leans for one in places)
+    holes, leans = compartments.find_holes(surface), any(one.leans for one in places)
     pieces = _make_pieces(row, mesh, corners, surface, places, holes)
     measured = MeasuredBin(
         box=_rounded(np.concatenate([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))]) - np.tile(origin, 2)),
         opening=_rounded(high - low),
         height=round(surface.rim - float(origin[2]), DIGITS),
-        origin=_rounded(turned(origin[None], yaw)[0]) if row.place == FILE else (0.0, 0.0, 0.0),
+        origin=_rounded(compartments.turned(origin[None], yaw)[0]) if row.place == FILE else (0.0, 0.0, 0.0),
         yaw=yaw or None,
         compartments=tuple(_rounded((*_shifted(one.floor, origin), *_moved(one.plane, origin))) for one in places),
         openings=tuple(_rounded(_shifted(one.opening, origin)) for one in places) if leans else None,
-        floor=_rounded(np.ptp(enclose([one.span for one in places]), axis=0)) if leans else None,
+        floor=_rounded(np.ptp(compartments.enclose([one.span for one in places]), axis=0)) if leans else None,
         checksum="",
     )
     mesh = replace(mesh, vertices=(mesh.vertices - origin).astype(np.float32))
@@ -106,12 +96,12 @@ def _model(row: BinRow) -> BinModel:
 
 
 def _make_pieces(
-    row: BinRow, mesh: TriangleMesh, corners: np.ndarray, surface: BinSurface, places: list[Compartment], holes: np.ndarray
+    row: BinRow, mesh: TriangleMesh, corners: np.ndarray, surface: BinSurface, places: list[compartments.Compartment], holes: np.ndarray
 ) -> tuple[ConvexPiece, ...]:
     """Collision shapes of a bin: those of its mesh, which must agree with it, or a closed box. Raises CatalogError: the mesh needs too
     many, or they differ from it."""
     if row.collision == BOX:
-        return make_box(surface, places, find_opening(surface, places))
+        return make_box(surface, places, compartments.find_opening(surface, places))
     advice = f', or set collision = "{BOX}", which closes its holes' if len(holes) else ""
     try:
         pieces = make_colliders(mesh.vertices, mesh.faces, surface)
@@ -148,14 +138,15 @@ def _explain(corners: np.ndarray, up: str) -> str:
     back = _rotation(up).T
     for other in AXES:
         surface = find_inside(matmul(corners, matmul(_rotation(other), back).T), COARSE)
-        if other != up and surface is not None and find_compartments(surface):
+        if other != up and surface is not None and compartments.find_compartments(surface):
             sizes[other] = float((surface.rim - surface.height[surface.inside]).sum()) * surface.cell**2
-    rule = f"as seen from above, with up = {up}: it is closed, flat, or not {1e3 * MIN_DEPTH:g} mm deep and {1e3 * MIN_SIDE:g} mm wide"
+    least = f"{1e3 * MIN_DEPTH:g} mm deep and {1e3 * compartments.MIN_SIDE:g} mm wide"
+    rule = f"as seen from above, with up = {up}: it is closed, flat, or not {least}"
     best = max(sizes, key=lambda name: sizes[name], default="")
     return f'{rule}; did you mean up = "{best}"?' if best else f"{rule}; a bin needs an open top"
 
 
-def _shifted(rectangle: Rectangle, origin: np.ndarray) -> tuple[float, ...]:
+def _shifted(rectangle: compartments.Rectangle, origin: np.ndarray) -> tuple[float, ...]:
     """Rectangle in the frame at `origin`."""
     x, y, *sides = rectangle
     return x - origin[0], y - origin[1], *sides
@@ -181,7 +172,7 @@ def _checksum(mesh: TriangleMesh, material: FileMaterial) -> str:
     return state.hexdigest()
 
 
-def _describe(measured: MeasuredBin, places: list[Compartment], unit: str, pieces: int) -> str:
+def _describe(measured: MeasuredBin, places: list[compartments.Compartment], unit: str, pieces: int) -> str:
     """Line on what was measured."""
     box, count = np.array(measured.box), len(places)
     rooms = "floor " if count == 1 else f"{count} compartments with floors of "

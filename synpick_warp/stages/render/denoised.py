@@ -44,21 +44,8 @@ from synpick_warp.kernels.tuning import CPU_EDGE_THREADS, CPU_FOOTPRINT_THREADS,
 from synpick_warp.stages.arrays import allocate_struct, bundle, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.launch import launch_pixels, launch_views
+from synpick_warp.stages.render import sampling_rates
 from synpick_warp.stages.render.looks import shade_floor
-from synpick_warp.stages.render.sampling_rates import (
-    accumulates,
-    coarse_size,
-    coverage_rays,
-    edge_rays,
-    first_frame_paths,
-    interleaved_threads,
-    keeps_frames,
-    kept_views,
-    paths_per_coarse_pixel,
-    shadow_size,
-    supersamples,
-    traces_paths,
-)
 from synpick_warp.stages.render.scene import RenderScene, build_grid
 from synpick_warp.stages.render.view_setup import body_sizes
 from synpick_warp.stages.timing import scope
@@ -173,17 +160,19 @@ FOOTPRINT_LISTS = struct_arrays(FootprintLists, "view", "chunk", footprint=("vie
 
 def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -> dict[str, int]:
     """Extents of the dimensions of the scratch other than the view, for images of `width` x `height` px."""
-    size = coarse_size(render, width, histories)
-    shadow = shadow_size(size)
+    size = sampling_rates.coarse_size(render, width, histories)
+    shadow = sampling_rates.shadow_size(size)
     tile_pixels = int(TILE_PIXELS) * shadow**2
     edge_tiles = min(int(EDGE_CHUNK_TILES), shadow_edges.MAX_CHUNK_PIXELS // tile_pixels)
     chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
-    samples = (width + 1) * (height + 1) * coverage_rays(render, width, histories)
-    columns, rows = (-(-width // size), -(-height // size)) if traces_paths(render) else (0, 0)
+    samples = (width + 1) * (height + 1) * sampling_rates.coverage_rays(render, width, histories)
+    columns, rows = (-(-width // size), -(-height // size)) if sampling_rates.traces_paths(render) else (0, 0)
     return {
         "cell_row": rows,
         "cell_column": columns,
-        "region": interleaved_threads(columns, rows) // int(REGION_PIXELS) if accumulates(render, histories) else 0,
+        "region": sampling_rates.interleaved_threads(columns, rows) // int(REGION_PIXELS)
+        if sampling_rates.accumulates(render, histories)
+        else 0,
         "rank": int(REGION_PIXELS),
         "path_kind": 2,
         "row": height,
@@ -203,10 +192,10 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
 def queue_sizes(render: Render, width: int, height: int, views: int, histories: int, device: wp.Device) -> dict[str, int]:
     """Extents of the dimensions of `PATH_QUEUES`, for at most `views` views of a batch. There are no queues on a CPU, which has no warps,
     nor where no paths are traced, or several in every coarse pixel."""
-    single = accumulates(render, histories) or paths_per_coarse_pixel(render, width, histories) == 1
-    size = coarse_size(render, width, histories)
-    regions = interleaved_threads(-(-width // size), -(-height // size)) // int(REGION_PIXELS)
-    queues = device.is_cuda and traces_paths(render) and single
+    single = sampling_rates.accumulates(render, histories) or sampling_rates.paths_per_coarse_pixel(render, width, histories) == 1
+    size = sampling_rates.coarse_size(render, width, histories)
+    regions = sampling_rates.interleaved_threads(-(-width // size), -(-height // size)) // int(REGION_PIXELS)
+    queues = device.is_cuda and sampling_rates.traces_paths(render) and single
     return {
         "queue_view": queue_views(views, regions, device.total_memory) if queues else views,
         "queue_region": regions if queues else 0,
@@ -226,7 +215,9 @@ def queue_views(views: int, regions: int, memory: int) -> int:
 
 def history_sizes(render: Render, width: int, height: int, histories: int) -> dict[str, int]:
     """Extents of the dimensions of `LIGHT_HISTORY`, for `histories` worlds times cameras with images of `width` x `height` px."""
-    return scratch_sizes(render, width, height, histories) | {"world_camera": histories if keeps_frames(render, histories) else 0}
+    return scratch_sizes(render, width, height, histories) | {
+        "world_camera": histories if sampling_rates.keeps_frames(render, histories) else 0
+    }
 
 
 def build_coarse_grid(image: Any, size: int, rays: int = 1) -> Any:
@@ -260,23 +251,26 @@ class DenoisedRenderer:
         """Allocate scratch. `render`: render settings: `mode` fast or unoccluded, `coarse_pixel`, `coarse_paths`, `bounces`, `history` and
         `antialias`. `seed`: seed of the data set. `views`: capacity of a batch. `histories`: worlds times cameras whose light is averaged
         over frames; 0: each frame by itself."""
-        size = coarse_size(render, scene.width, histories)
+        size = sampling_rates.coarse_size(render, scene.width, histories)
         sizes = {"view": views} | scratch_sizes(render, scene.width, scene.height, histories)
         self.scene = scene
-        self.traces_paths = traces_paths(render)
+        self.traces_paths = sampling_rates.traces_paths(render)
         self.coarse = build_coarse_grid(scene.grid, size)
         if not self.traces_paths:
             self.coarse.size = 0
-        self.shadow_grid = build_coarse_grid(scene.grid, shadow_size(size), edge_rays(size))
-        self.rules = make_path_rules(render, seed, paths_per_coarse_pixel(render, scene.width, histories), ROULETTE)
-        self.rules.first_samples = first_frame_paths(render, scene.width, histories)
+        self.shadow_grid = build_coarse_grid(scene.grid, sampling_rates.shadow_size(size), sampling_rates.edge_rays(size))
+        self.rules = make_path_rules(render, seed, sampling_rates.paths_per_coarse_pixel(render, scene.width, histories), ROULETTE)
+        self.rules.first_samples = sampling_rates.first_frame_paths(render, scene.width, histories)
         self.rules.min_roughness, self.rules.firefly_clamp = MIN_ROUGHNESS, FIREFLY_CLAMP
         self.variance_scale = SINGLE_PATH_VARIANCE_SCALE if self.rules.samples == 1 else 1.0
         self.history = allocate_struct(LIGHT_HISTORY, history_sizes(render, scene.width, scene.height, histories), scene.device)
-        self.history.cameras, self.history.max_paths = scene.camera_count, render.history if accumulates(render, histories) else 0
+        self.history.cameras, self.history.max_paths = (
+            scene.camera_count,
+            render.history if sampling_rates.accumulates(render, histories) else 0,
+        )
         self.history.frame.fill_(int(NEVER))
-        keeps = keeps_frames(render, histories)
-        self.history.kept = self.kept = kept_views(render, scene.camera_count, histories)
+        keeps = sampling_rates.keeps_frames(render, histories)
+        self.history.kept = self.kept = sampling_rates.kept_views(render, scene.camera_count, histories)
         self.kept_rows = self.kept + views if 0 < self.kept < histories else self.kept
         sizes |= body_sizes(instances, scene.width, scene.height) | {"world_camera": histories if keeps else 0, "kept": self.kept_rows}
         self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
@@ -290,9 +284,9 @@ class DenoisedRenderer:
         self.shadow_rays = allocate_struct(SHADOW_RAYS, sizes, scene.device)
         self.shadows = allocate_struct(LAMP_SHADOWS, sizes, scene.device)
         self.edge_lists = allocate_struct(EDGE_LISTS, sizes, scene.device)
-        self.shade_kernel = shade_samples_kernel if supersamples(render, scene.width, histories) else shade_kernel
+        self.shade_kernel = shade_samples_kernel if sampling_rates.supersamples(render, scene.width, histories) else shade_kernel
         self.antialias = render.antialias
-        self.coverage_rays = coverage_rays(render, scene.width, histories)
+        self.coverage_rays = sampling_rates.coverage_rays(render, scene.width, histories)
         sizes["cell_tile"], sizes["shadow_tile"] = self.coarse.grid.tiles, self.shadow_grid.grid.tiles
         self.flags = allocate_struct(TILE_FLAGS, sizes, scene.device)
         self.flags.stages.fill_(ALL_STAGES)
@@ -343,7 +337,7 @@ class DenoisedRenderer:
     def trace_coarse_paths(self, shot: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels, traced or taken from the history (temporal accumulation). Wavefront
         path tracing where there are queues: one launch for the first bounce, then one for each further bounce."""
-        scene, views, threads = self.scene, shot.views, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
+        scene, views, threads = self.scene, shot.views, sampling_rates.interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
         if self.history.max_paths > 0:
             self.path_lists.count.zero_()
             self.flags.due.zero_()
