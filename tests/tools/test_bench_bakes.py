@@ -20,7 +20,7 @@ from tests.harness.processes import wait_for
 from tests.tools.test_reports import SHORT_PICKS
 from tests.worlds.box_sets import episode_content
 from tools.bench import __main__ as bench
-from tools.bench import bakes, cleaning, run, scaling
+from tools.bench import bakes, cleaning, run, worlds
 from tools.bench.bakes import Usage, measure_usage
 from tools.bench.cleaning import CleanedSet, Cleaner, Tally
 from tools.bench.run import Bench
@@ -204,7 +204,7 @@ def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):
 
 
 def test_growth_by_instances_has_rows_of_each_number(tmp_path, monkeypatch):
-    for module, name in ((scaling, "DROP_TICKS"), (scaling, "REST_TICKS"), (run, "BURST"), (run, "MIN_REPEATS")):
+    for module, name in ((worlds, "DROP_TICKS"), (worlds, "REST_TICKS"), (run, "BURST"), (run, "MIN_REPEATS")):
         monkeypatch.setattr(module, name, 1)
     rows = bench_rows(tmp_path, "--parts", "growth", "--instances", "2,40", "--seconds", "0", "--set", "physics.steps_per_tick=1")
     for number in (2, 40):
@@ -218,11 +218,11 @@ def test_growth_by_instances_has_rows_of_each_number(tmp_path, monkeypatch):
 def test_each_replacement_of_newton_is_left_out_once(monkeypatch):
     def left_out() -> int:
         """Number whose bits are the parts that are Newton's own."""
-        return sum(2**bit for bit, (name, own) in enumerate(scaling.NEWTONS_OWN.values()) if getattr(scaling.physics, name) is own)
+        return sum(2**bit for bit, (name, own) in enumerate(worlds.NEWTONS_OWN.values()) if getattr(worlds.physics, name) is own)
 
     config = bench.Config().with_values({"bake.worlds": 4})
-    steps = scaling.TICKS * config.physics.steps_per_tick * config.bake.worlds
-    monkeypatch.setattr(scaling, "load_catalog", lambda config: None)
-    monkeypatch.setattr(scaling, "Simulation", lambda *given: given)
-    monkeypatch.setattr(scaling, "_time_stirring", lambda simulation: steps / (1.0 + left_out()))
-    assert [row.value - 1.0 for row in scaling.measure_patches(Bench(config, 0.0))] == pytest.approx([0, 1, 2, 4, 7, 0])
+    steps = worlds.TICKS * config.physics.steps_per_tick * config.bake.worlds
+    monkeypatch.setattr(worlds, "load_catalog", lambda config: None)
+    monkeypatch.setattr(worlds, "Simulation", lambda *given: given)
+    monkeypatch.setattr(worlds, "_time_stirring", lambda simulation: steps / (1.0 + left_out()))
+    assert [row.value - 1.0 for row in worlds.measure_patches(Bench(config, 0.0))] == pytest.approx([0, 1, 2, 4, 7, 0])

@@ -26,7 +26,7 @@ from tests.worlds.shapes import GREY, UPRIGHT, ball, box, camera, entry, sheet
 from tests.worlds.small_worlds import catalog
 from tests.worlds.toy_scene import ToyScene, render, snapshot
 from tools.bench import __main__ as bench
-from tools.bench import peer_scenes, peers, pictures, run, worlds
+from tools.bench import online, peer_scenes, peers, run, worlds
 from tools.options import MeasuredRow
 
 WORLDS, CAMERAS, BATCH, AFTER, HISTORY_TICKS, KEPT_TICKS, ROUNDS = 2, 3, 4, 2, 2, 3, 2
@@ -43,7 +43,7 @@ def measured(tmp_path_factory):
     def watch_render(self: Renderer, snapshot, views, out, layers=None) -> None:
         render(self, snapshot, views, out, layers)
         world, camera = (array.numpy()[: views.count] for array in (views.world, views.camera))
-        history = pictures.light_history(self)
+        history = online.light_history(self)
         slots = world * CAMERAS + camera
         batches.append(
             SimpleNamespace(
@@ -62,7 +62,7 @@ def measured(tmp_path_factory):
         simulations.append((self, self.record.snapshot.frame.numpy().copy()))
 
     with (
-        mock.patch.multiple(pictures, HISTORY_TICKS=HISTORY_TICKS, KEPT_TICKS=KEPT_TICKS, ROUNDS=ROUNDS),
+        mock.patch.multiple(online, HISTORY_TICKS=HISTORY_TICKS, KEPT_TICKS=KEPT_TICKS, ROUNDS=ROUNDS),
         mock.patch.object(Renderer, "render", watch_render),
         mock.patch.object(Simulation, "tick", watch_tick),
     ):

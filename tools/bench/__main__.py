@@ -23,12 +23,10 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.system.hardware.device import pick_device
 from tools import options as command_line
 from tools.bench.bakes import measure_steady, measure_trajectories
-from tools.bench.online import measure_environment
+from tools.bench.online import measure_environment, measure_pictures
 from tools.bench.peers import PEERS, check_installed, measure_peers
-from tools.bench.pictures import measure_pictures
 from tools.bench.run import Bench
-from tools.bench.scaling import measure_growth, measure_patches
-from tools.bench.worlds import measure_worlds
+from tools.bench.worlds import measure_growth, measure_patches, measure_worlds
 from tools.figures import describe_run, write_run
 
 SHARED_PARTS = ("physics", "perception", "render", "encode", "stream")

@@ -162,7 +162,7 @@ def read_ticks(path: Path, instances: int) -> np.ndarray:
 
 def write_episode(spool: Path, instances: int, place: Path, end: EpisodeEnd, settings: UsdSettings) -> None:
     """Task: write an episode's file beside its spool, of a `TickSpool` with this capacity, and rename it to its place beside `assets/`."""
-    from synpick_warp.exporters.usd.parts import save_layer
+    from synpick_warp.exporters.usd.assets import save_layer
     from synpick_warp.exporters.usd.stage import make_episode_layer
 
     ticks = read_ticks(spool, instances)

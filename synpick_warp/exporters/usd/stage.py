@@ -16,7 +16,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 from synpick_warp.codes import SHAFT, Ending, LookPart
 from synpick_warp.configs.cell.cameras import GRIPPER
 from synpick_warp.exporters.usd import episode
-from synpick_warp.exporters.usd.parts import add_label, add_property, add_surface, set_units
+from synpick_warp.exporters.usd.assets import add_label, add_property, add_surface, set_units
 from synpick_warp.scenes.assets.appearance import as_color, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.cameras import CAMERA_KEYS, carry
 from synpick_warp.scenes.types import BLACK, Camera, Material

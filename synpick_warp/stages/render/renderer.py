@@ -12,10 +12,9 @@ from synpick_warp.stages.render.cameras import allocate_view_cameras
 from synpick_warp.stages.render.denoised import DenoisedRenderer, ReferenceRenderer
 from synpick_warp.stages.render.layers import LayerRenderer, sensor_parameters
 from synpick_warp.stages.render.looks import Dresser
-from synpick_warp.stages.render.postprocess import PostProcessor, has_effects
+from synpick_warp.stages.render.postprocess import PostProcessor, Shutter, has_effects
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.shutter import Shutter
 from synpick_warp.stages.render.transparency import SceneBehind, allocate_image
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, PropPlacer, body_sizes, make_shot, set_up_views, with_cameras
 from synpick_warp.stages.timing import scope

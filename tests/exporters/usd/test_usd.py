@@ -19,9 +19,8 @@ from synpick_warp.configs.cell.bins import BinRow, Bins
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.formats import FORMAT_TABLE
-from synpick_warp.exporters.usd.assets import write_light_maps
+from synpick_warp.exporters.usd.assets import new_asset, save_layer, write_light_maps
 from synpick_warp.exporters.usd.exporter import UsdExporter
-from synpick_warp.exporters.usd.parts import new_asset, save_layer
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.embedded.skies import skies
@@ -72,7 +71,7 @@ LIMITED = """
 import resource, signal, sys
 from pathlib import Path
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.usd.parts import new_asset, save_layer
+from synpick_warp.exporters.usd.assets import new_asset, save_layer
 stage = new_asset("thing", "thing")
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))

@@ -10,7 +10,7 @@ from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.types import Glass
 from synpick_warp.stages.buffers import allocate_view_buffers
 from synpick_warp.stages.render.cameras import allocate_view_cameras, place_cameras
-from synpick_warp.stages.render.shutter import plan_sub_frames
+from synpick_warp.stages.render.postprocess import plan_sub_frames
 from tests.worlds.shapes import UPRIGHT, box, camera, distorted, entry, sheet, surface
 from tests.worlds.toy_scene import ToyScene, build_scene, snapshot, views_of, with_render
 

@@ -12,10 +12,9 @@ from synpick_warp.codes import MAX_DISPARITIES
 from synpick_warp.configs.cell.cameras import DepthSensor
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.render.images.stereo_matching import sum_path_costs_kernel
-from synpick_warp.stages.render import stereo
-from synpick_warp.stages.render.layers import sensor_parameters
+from synpick_warp.stages.render import layers
+from synpick_warp.stages.render.layers import StereoRenderer, count_disparities, sensor_parameters
 from synpick_warp.stages.render.scene import blank_scene
-from synpick_warp.stages.render.stereo import StereoRenderer, count_disparities
 from synpick_warp.stages.render.view_setup import first_views
 from tests.twins.layers import matching_costs, path_costs, render_layers
 from tests.worlds.shapes import UPRIGHT, box, camera, entry, sheet, surface
@@ -235,8 +234,8 @@ def test_fractions_of_a_pixel_are_not_drawn_to_whole_ones(device, fraction):
 @pytest.mark.parametrize("slots", [1, 2])
 def test_depth_is_that_of_single_views_and_of_unstored_images(device, slots, monkeypatch):
     """Also if the last views do not fill the slots."""
-    monkeypatch.setattr(stereo, "CPU_SLOTS", slots)
-    monkeypatch.setattr(stereo, "GPU_SLOTS", slots)
+    monkeypatch.setattr(layers, "CPU_SLOTS", slots)
+    monkeypatch.setattr(layers, "GPU_SLOTS", slots)
     toy = step_scene()
     toy.placed = [*toy.placed, *wall(1.3, 0.5).placed, *toy.placed]
     together = see(toy, device, **NOISY)
