@@ -13,8 +13,7 @@ from synpick_warp.apps.viz.explain_record import read_attempts
 from synpick_warp.codes import Ending, Measure, Mode, Outcome, Phase, Task
 from synpick_warp.configs.dataset import may_pick
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.annotations import check_content
-from synpick_warp.dataset.records import Row
+from synpick_warp.dataset.annotations import Row, check_content
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.factory.episodes import EpisodeOutcome, encode_line, remedy
 from synpick_warp.views.frames import bin_record

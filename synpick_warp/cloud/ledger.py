@@ -10,6 +10,7 @@ from typing import Any
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.annotations import Manifest
 from synpick_warp.dataset.commit.manifest import (
     CONFIG_FILE,
     ENTRIES,
@@ -20,7 +21,6 @@ from synpick_warp.dataset.commit.manifest import (
     episode_entry,
     make_manifest,
 )
-from synpick_warp.dataset.records import Manifest
 from synpick_warp.errors import ConfigError, OutputError, StoreError
 from synpick_warp.system.inputs.files import MAX_JSON, MAX_TOML, decode_json
 from synpick_warp.system.stores.opening import CONTROL, Probe, open_store

@@ -6,8 +6,7 @@ becomes 0 or 255, without a warning. This one keeps what was written; entries th
 
 import numpy as np
 
-from synpick_warp.dataset.annotations import MASK_SCHEMA, check_json
-from synpick_warp.dataset.records import MAX_INSTANCES
+from synpick_warp.dataset.annotations import MASK_SCHEMA, MAX_INSTANCES, check_json
 from synpick_warp.dataset.view_files import check_run_lengths, decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.image_files import decode_image

@@ -8,7 +8,7 @@ import numpy as np
 
 from synpick_warp.codes import Ending, Mode, Outcome, Phase, Task
 from synpick_warp.configs.schema import Suction
-from synpick_warp.dataset.records import Attempt, InstanceObservation, RecordedObservation
+from synpick_warp.dataset.annotations import Attempt, InstanceObservation, RecordedObservation
 from synpick_warp.stages.arrays import WORD_BITS, unpack_words
 from synpick_warp.stages.stream import TickReport
 

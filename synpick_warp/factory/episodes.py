@@ -14,7 +14,7 @@ import msgspec
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.files.load import override_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.records import Attempt
+from synpick_warp.dataset.annotations import Attempt
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
 from synpick_warp.scenes.bin_meshes.loading import measure_meshes
 from synpick_warp.system.hardware.cores import count_cores

@@ -104,7 +104,7 @@ class Seals:
 
 @wp.struct
 class Observations:
-    """Perception result of each instance, when its world was last observed; `dataset.records.InstanceObservation` has it as JSON."""
+    """Perception result of each instance, when its world was last observed; `dataset.annotations.InstanceObservation` has it as JSON."""
 
     visible: wp.array2d[int]
     """(world, instance): visible pixels [px]: size of the largest component; 0: not visible."""

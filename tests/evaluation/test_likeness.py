@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from synpick_warp.apps.evaluation.likeness import (
+from synpick_warp.apps.evaluation.twins import (
     Appearance,
     Likeness,
     average,

@@ -24,7 +24,7 @@ from synpick_warp.codes import Effect, Outcome, Task, names
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import FORMATS, Config, Split
-from synpick_warp.dataset.records import Attempt, InstanceObservation
+from synpick_warp.dataset.annotations import Attempt, InstanceObservation
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import ExportContext, list_folders
 from synpick_warp.exporters.formats import FORMAT_TABLE

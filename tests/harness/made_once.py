@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 from newton._src.geometry import narrow_phase
 
-from synpick_warp.apps.conversion import foreign, run
+from synpick_warp.apps.conversion import run
 from synpick_warp.apps.evaluation import figures
 from synpick_warp.apps.viz import explain
 from synpick_warp.cloud import run as cloud_run
@@ -90,7 +90,7 @@ def written_here() -> Iterator[None]:
         return WriterPool(processes if processes > 1 else 0, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (pipeline, run, foreign, merge, cloud_run):
+        for module in (pipeline, run, merge, cloud_run):
             patch.setattr(module, "WriterPool", pool)
         for module in (explain, figures):
             patch.setattr(module, "render_charts", render_here)

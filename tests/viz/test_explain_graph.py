@@ -32,7 +32,7 @@ from synpick_warp.apps.viz.explain_record import (
     read_attempts,
 )
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.dataset.records import MAX_OBSERVED
+from synpick_warp.dataset.annotations import MAX_OBSERVED
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.scene import find_occlusions, find_supports, find_unstacking_order
 from synpick_warp.exporters.writing.rle import Masks, find_runs

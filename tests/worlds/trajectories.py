@@ -12,7 +12,7 @@ import numpy as np
 from synpick_warp.apps.viz.explain_record import SeenAttempt
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config, Trajectory
-from synpick_warp.dataset.records import InstanceObservation, RecordedObservation
+from synpick_warp.dataset.annotations import InstanceObservation, RecordedObservation
 from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, TrajectoryArray
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.testing import box_views

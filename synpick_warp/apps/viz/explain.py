@@ -13,8 +13,8 @@ from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.episodes.manipulation import Pick, Target
 from synpick_warp.configs.files.load import load_config
+from synpick_warp.dataset.annotations import Pixel
 from synpick_warp.dataset.bop.layout import object_names
-from synpick_warp.dataset.records import Pixel
 from synpick_warp.dataset.scene_index import SceneIndex
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError

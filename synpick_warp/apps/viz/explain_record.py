@@ -18,10 +18,9 @@ import numpy as np
 from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, blank, instance_color, put_text, readable_on, short_labels
 from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.configs.episodes.manipulation import ANOTHER, Pick, Target
-from synpick_warp.dataset import records
-from synpick_warp.dataset.annotations import ADVICE, check_content
+from synpick_warp.dataset import annotations
+from synpick_warp.dataset.annotations import ADVICE, InstanceObservation, check_content
 from synpick_warp.dataset.commit.manifest import ATTEMPTS_FILE
-from synpick_warp.dataset.records import InstanceObservation
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import MAX_JSON, decode_json, read_file
 
@@ -37,11 +36,11 @@ MAX_RUNS = 20
 """Most ranges of numbers that a message lists."""
 
 
-class SeenAttempt(records.Attempt, dict=True):
+class SeenAttempt(annotations.Attempt, dict=True):
     """Pick attempt as its record, of which the target was visible, and all suction points are in the image."""
 
     def __post_init__(self) -> None:
-        records.Attempt.__post_init__(self)
+        annotations.Attempt.__post_init__(self)
         width, height = self.observation.resolution
         if self.target is not None and self.target not in self.objects:
             raise ValueError(f"target is {self.target}, which was not visible")
@@ -74,7 +73,7 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[SeenA
     """Read the attempts of an episode, sorted, or one of them; raises DatasetError if the file is missing or damaged, or lacks the
     attempt."""
     path, lines = _read_lines(dataset)
-    keys = [decode_json(line, records.AttemptKey, _line(path, row), DatasetError, ADVICE) for row, line in enumerate(lines)]
+    keys = [decode_json(line, annotations.AttemptKey, _line(path, row), DatasetError, ADVICE) for row, line in enumerate(lines)]
     episodes = sorted({key.episode for key in keys})
     if episode not in episodes:
         raise DatasetError(f"{path} has no attempt of episode {episode}; {_which('episodes that have', episodes)}")

@@ -327,8 +327,7 @@ def estimate(
 
 def write_gap(data: Path, out: Path, split: str | None, settings: Config) -> int:
     """Write twins of a data set, or of one split, and print how its objects look in both; returns the exit code."""
-    from synpick_warp.apps.evaluation.likeness import Appearance, average
-    from synpick_warp.apps.evaluation.twins import RECORD, write_twins
+    from synpick_warp.apps.evaluation.twins import RECORD, Appearance, average, write_twins
     from synpick_warp.cli.display import count_on_stderr
 
     data = find_data_set(data, "synpick-warp gap DIR")

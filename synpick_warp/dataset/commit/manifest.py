@@ -38,8 +38,7 @@ from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.files.load import load_config, override_config, table_lists
 from synpick_warp.configs.files.table_lists import given_values
 from synpick_warp.configs.schema import CLASSIC, COLUMN, WITHIN, Config
-from synpick_warp.dataset.annotations import ADVICE
-from synpick_warp.dataset.records import Entry, IndicesEntry, Manifest, RecordedEpisode, read_record
+from synpick_warp.dataset.annotations import ADVICE, Entry, IndicesEntry, Manifest, RecordedEpisode, read_record
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import find_format, format_names, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE

@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.lighting.tile_flags import DAMAGED, RELIT, Tile
 from synpick_warp.kernels.render.visibility.triangles import Triangle, edge_areas
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import EnvironmentMap, TriangleMesh
-from synpick_warp.stages.render import denoised
+from synpick_warp.stages.render import denoised, sampling_rates
 from synpick_warp.stages.render.sampling_rates import COVERAGE_RAYS, NARROW_COVERAGE_RAYS
 from synpick_warp.stages.render.scene import build_grid
 from tests.harness.probe import probe
@@ -278,7 +278,7 @@ def radiance_of(mesh, material, pose, device, scale=1) -> np.ndarray:
     ],
 )
 def test_images_whose_coarse_pixels_are_pixels_are_supersampled(settings, width, histories, expected):
-    assert denoised.supersamples(with_render(**settings).render, width, histories) == expected
+    assert sampling_rates.supersamples(with_render(**settings).render, width, histories) == expected
 
 
 def test_points_lie_on_the_plane_of_the_triangle(device):
@@ -320,7 +320,7 @@ def test_a_plain_flat_surface_is_the_same_with_either_kernel(device, monkeypatch
     """All points of a matt, evenly lit plane have the same radiance, so that supersampling changes nothing."""
     matt = surface((0.5, 0.4, 0.3))
     found = radiance_of(sheet(0.4, 0.3), matt, TILTED, device)
-    monkeypatch.setattr(denoised, "supersamples", lambda *_: False)
+    monkeypatch.setattr(sampling_rates, "supersamples", lambda *_: False)
     np.testing.assert_allclose(found, radiance_of(sheet(0.4, 0.3), matt, TILTED, device), rtol=2e-3)
 
 
