@@ -19,23 +19,11 @@ from typing import IO, Any
 
 import msgspec
 
+from synpick_warp.cloud.claims import ENTRY
 from synpick_warp.cloud.delivery import FILES_AT_ONCE
-from synpick_warp.cloud.ledger import ENTRY
 from synpick_warp.configs.dataset import episode_range
 from synpick_warp.dataset.annotations import ADVICE, Index
-from synpick_warp.dataset.commit.manifest import (
-    CONFIG_FILE,
-    CONSTANTS,
-    ENTRIES,
-    EPISODES_FILE,
-    INDICES,
-    MANIFEST_FILE,
-    episode_entry,
-    read_checksums,
-    read_entry,
-    read_manifest,
-    read_settings,
-)
+from synpick_warp.dataset.commit import manifest as manifests
 from synpick_warp.dataset.commit.verify import Verdict, check_part
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
@@ -103,18 +91,18 @@ class Copier:
     def fetch_files(self, entry: Path, *, check: bool = True) -> dict[str, str]:
         """Download the files of a manifest entry that is in the folder, none larger than all of them together; returns their SHA-256 by
         name. `check`: whether to compare it."""
-        names, limit = read_checksums(self.folder, entry), (read_entry(self.folder, entry) or {"bytes": 0})["bytes"]
+        names, limit = manifests.read_checksums(self.folder, entry), (manifests.read_entry(self.folder, entry) or {"bytes": 0})["bytes"]
         self.fetch_all({name: (digest if check else None, limit) for name, digest in names.items()})
         return names
 
     def fetch_records(self) -> None:
         """Download manifest and settings. Raises DatasetError: there is no manifest; StoreError: there is no bucket."""
-        if not self.fetch(MANIFEST_FILE):
+        if not self.fetch(manifests.MANIFEST_FILE):
             with contextlib.suppress(FileNotFoundError):
-                self.store.get(MANIFEST_FILE, MAX_JSON)  # Raises StoreError if there is no bucket, which HEAD does not tell.
-            raise DatasetError(f"{self.store.url} has no {MANIFEST_FILE}; name the prefix of a data set that synpick-warp baked")
-        self.fetch(CONFIG_FILE, limit=MAX_TOML)
-        (self.folder / ENTRIES).mkdir(exist_ok=True)
+                self.store.get(manifests.MANIFEST_FILE, MAX_JSON)  # Raises StoreError if there is no bucket, which HEAD does not tell.
+            raise DatasetError(f"{self.store.url} has no {manifests.MANIFEST_FILE}; name the prefix of a data set that synpick-warp baked")
+        self.fetch(manifests.CONFIG_FILE, limit=MAX_TOML)
+        (self.folder / manifests.ENTRIES).mkdir(exist_ok=True)
 
     def fetch_entry(self, entry: Path) -> bool:
         """Download a manifest entry, both files; returns whether there is one."""
@@ -122,7 +110,7 @@ class Copier:
 
     def episodes(self) -> Iterator[int]:
         """Yield the episodes that have a done mark, in the order of their keys, lazily."""
-        for key, _ in self.store.list(str(ENTRIES)):
+        for key, _ in self.store.list(str(manifests.ENTRIES)):
             if match := ENTRY.fullmatch(key):
                 yield int(match[1])
 
@@ -139,7 +127,7 @@ def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name
     for name, length in copier.store.list(""):
         if name.startswith(f"{CONTROL}/") or not wanted(name):
             continue
-        names[name] = None, MAX_JSON if name.startswith(f"{ENTRIES}/") else length
+        names[name] = None, MAX_JSON if name.startswith(f"{manifests.ENTRIES}/") else length
         size += length
         if size > free:
             raise DatasetError(
@@ -157,19 +145,19 @@ def verify_store(url: str, report: Report = ignore_progress) -> Verdict:
         folder = Path(name)
         copier = Copier(url, folder)
         copier.fetch_records()
-        manifest, files, episodes, listed, finished = read_manifest(folder), 0, [], [], False
+        manifest, files, episodes, listed, finished = manifests.read_manifest(folder), 0, [], [], False
         try:
-            read_settings(folder, manifest)
+            manifests.read_settings(folder, manifest)
             episodes = sorted(copier.episodes())
-            for done, entry in enumerate((CONSTANTS, *map(episode_entry, episodes), INDICES)):
+            for done, entry in enumerate((manifests.CONSTANTS, *map(manifests.episode_entry, episodes), manifests.INDICES)):
                 checked, listed = _verify_entry(copier, entry)
                 files += checked
                 report("episodes", min(done, len(episodes)), len(episodes))
-                if entry == INDICES:
+                if entry == manifests.INDICES:
                     finished = listed == episodes
         except (ConfigError, DatasetError, SizeError) as error:
             return Verdict(str(error).replace(name, url), len(episodes), files, finished)
-    names = (f"{episode_entry(episode)}.json" for episode in sorted(set(listed) - set(episodes)))
+    names = (f"{manifests.episode_entry(episode)}.json" for episode in sorted(set(listed) - set(episodes)))
     gone = next((name for name in names if copier.store.stat(name) is None), None)  # Others were committed meanwhile.
     return Verdict(f"{url}/{gone} is missing" if gone else "", len(episodes), files, finished)
 
@@ -178,14 +166,14 @@ def _verify_entry(copier: Copier, entry: Path) -> tuple[int, list[int]]:
     """Download and verify the files of an entry, and delete them; returns their number, and the episodes that the indices list. Raises
     DatasetError: A file is missing or damaged."""
     if not copier.fetch_entry(entry):
-        if entry == INDICES:
+        if entry == manifests.INDICES:
             return 0, []
         raise DatasetError(f"{copier.store.url}/{entry}.json or .sha256 is missing; resume the bake")
     folder, names = copier.folder, copier.fetch_files(entry, check=False)
     checked = check_part(folder, entry)
     if checked.problem:
         raise DatasetError(checked.problem)
-    listed = (read_entry(folder, entry) or {}).get("episodes", [])
+    listed = (manifests.read_entry(folder, entry) or {}).get("episodes", [])
     for name in (*names, f"{entry}.json", f"{entry}.sha256"):
         (folder / name).unlink(missing_ok=True)
     return checked.files, listed
@@ -206,16 +194,16 @@ class StoreCache:
         """Cached episodes with their sizes [B], least recently used first."""
         self.copier.fetch_records()
         try:
-            read_settings(self.folder, read_manifest(self.folder))
+            manifests.read_settings(self.folder, manifests.read_manifest(self.folder))
         except (ConfigError, DatasetError) as error:
             raise type(error)(str(error).replace(str(self.folder), url)) from None
-        for entry in (CONSTANTS, INDICES):
+        for entry in (manifests.CONSTANTS, manifests.INDICES):
             if self.copier.fetch_entry(entry):
                 self.copier.fetch_files(entry)
 
     def has(self, episode: int) -> bool:
         """Whether an episode is committed: cached, or its done mark is in the store."""
-        return episode in self._held or self.copier.store.stat(f"{episode_entry(episode)}.json") is not None
+        return episode in self._held or self.copier.store.stat(f"{manifests.episode_entry(episode)}.json") is not None
 
     def fetch(self, episode: int) -> None:
         """Download an episode, checked by its checksums, and evict the least recently used ones beyond the limit. Raises DatasetError: it
@@ -223,7 +211,7 @@ class StoreCache:
         if episode in self._held:
             self._held.move_to_end(episode)
             return
-        entry = episode_entry(episode)
+        entry = manifests.episode_entry(episode)
         self.copier.fetch_entry(entry)
         names = self.copier.fetch_files(entry)
         missing = next((name for name in names if not (self.folder / name).exists()), None)
@@ -232,7 +220,10 @@ class StoreCache:
         self._held[episode] = sum((self.folder / name).stat().st_size for name in names)
         while len(self._held) > 1 and sum(self._held.values()) > self.limit:
             old, _ = self._held.popitem(last=False)
-            for name in (*read_checksums(self.folder, episode_entry(old)), *(f"{episode_entry(old)}{end}" for end in (".json", ".sha256"))):
+            for name in (
+                *manifests.read_checksums(self.folder, manifests.episode_entry(old)),
+                *(f"{manifests.episode_entry(old)}{end}" for end in (".json", ".sha256")),
+            ):
                 (self.folder / name).unlink(missing_ok=True)
 
 
@@ -276,7 +267,7 @@ class StoreDataSet(DataSet):
     @cached_property
     def _frames(self) -> dict[int, int]:
         """Number of frames of each episode, 0 if it was given up, by the list of episodes; empty while there is no such list."""
-        path = self.folder / EPISODES_FILE
+        path = self.folder / manifests.EPISODES_FILE
         if not path.exists():
             return {}
         lines = enumerate(read_file(path, MAX_JSON, DatasetError).splitlines(), 1)

@@ -15,7 +15,7 @@ from synpick_warp.configs.cell.gripper import COMMON, SUCTION1, SUCTION_ARRAY, G
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.modelling import Patch, at_height, join, lathe, make_mesh, rounded_rectangle, solid
-from synpick_warp.scenes.tool_bodies import read_body
+from synpick_warp.scenes.props import read_body
 from synpick_warp.scenes.types import Catalog, ConvexPiece, Fixture, Material, TriangleMesh
 from synpick_warp.system.plugins import load_plugin
 

@@ -23,7 +23,7 @@ from synpick_warp.scenes.bins import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, guide
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.grippers import HEADS, check_reach, finger_collider, finger_fixture, make_head
 from synpick_warp.scenes.modelling import at_height, cap, join, loft, make_mesh, rounded_rectangle, strips
-from synpick_warp.scenes.tool_bodies import measure_tool
+from synpick_warp.scenes.props import measure_tool
 from synpick_warp.stages.sim.behavior import BEHAVIORS
 from tests.harness.pieces import assert_closed, felt, filled, is_convex
 from tests.twins.raycast import edges_match, first_hit

@@ -13,17 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp._version import __version__
-from synpick_warp.dataset.commit.manifest import (
-    CONSTANTS,
-    MANIFEST_FILE,
-    committed_episodes,
-    describe_differences,
-    episode_entry,
-    make_manifest,
-    read_checksums,
-    read_manifest,
-    read_settings,
-)
+from synpick_warp.dataset.commit import manifest as manifests
 from synpick_warp.dataset.commit.verify import check_files
 from synpick_warp.errors import DatasetError, SynpickError
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
@@ -52,18 +42,20 @@ def prove(folder: Path, share: float, seed: int, progress: Progress, device: str
     `device`: None, that of the settings. Raises DatasetError: the folder is not a data set, has no episodes, or is of other versions;
     ConfigError: its objects or lights are not those of the bake; SynpickError as the bake.
     """
-    manifest = read_manifest(folder)
-    config = read_settings(folder, manifest).with_values({"bake.device": device} if device else {})
-    if said := describe_differences(make_manifest(config), manifest):
+    manifest = manifests.read_manifest(folder)
+    config = manifests.read_settings(folder, manifest).with_values({"bake.device": device} if device else {})
+    if said := manifests.describe_differences(manifests.make_manifest(config), manifest):
         raise DatasetError(f"{folder} cannot be proved here: {said}; only the same versions bake the same bytes")
-    known = committed_episodes(folder)
+    known = manifests.committed_episodes(folder)
     if not known:
         raise DatasetError(f"{folder} has no episodes yet; resume its bake first")
     drawn = sorted(random.Random(seed).sample(known, math.ceil(share * len(known)) or 1))
     with tempfile.TemporaryDirectory(prefix="synpick-prove-") as name:
         again = Path(name) / folder.resolve().name
         again.mkdir()
-        (again / MANIFEST_FILE).write_bytes((folder / MANIFEST_FILE).read_bytes())  # Its digests of objects and lights are compared.
+        (again / manifests.MANIFEST_FILE).write_bytes(
+            (folder / manifests.MANIFEST_FILE).read_bytes()
+        )  # Its digests of objects and lights are compared.
         try:
             summary = bake_episodes(measured(config, ()), again, progress, drawn, deliver=lambda: None)
         except SynpickError as error:
@@ -85,8 +77,8 @@ def record_proof(folder: Path, proof: Proof) -> None:
 def _compare(folder: Path, again: Path, episodes: list[int]) -> tuple[int, str]:
     """Compare constants and episodes of two data sets up to the first difference. Returns the number of files and the difference, or ""."""
     files = 0
-    for entry in (CONSTANTS, *map(episode_entry, episodes)):
-        then, now = (read_checksums(each, entry) for each in (folder, again))
+    for entry in (manifests.CONSTANTS, *map(manifests.episode_entry, episodes)):
+        then, now = (manifests.read_checksums(each, entry) for each in (folder, again))
         for name in sorted(then | now):
             files += 1
             if then.get(name) != now.get(name):

@@ -15,23 +15,7 @@ from typing import Any, BinaryIO, NamedTuple
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.commit.manifest import (
-    CONFIG_FILE,
-    CONSTANTS,
-    ENTRIES,
-    INPUTS,
-    check_file_names,
-    committed_episodes,
-    describe_differences,
-    describe_inputs,
-    describe_strays,
-    encode_manifest,
-    episode_entry,
-    read_checksums,
-    read_entry,
-    read_manifest,
-    read_settings,
-)
+from synpick_warp.dataset.commit import manifest as manifests
 from synpick_warp.dataset.commit.writing import finalize_data_set, lock_folder, remove_path
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import Needs
@@ -64,12 +48,12 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
     match, and OutputError if a file cannot be written."""
     if (url := next(filter(None, map(store_url, parts)), None)) is not None:
         raise DatasetError(f"{url} is in an object store, where all of --shard fill one prefix; merge takes folders of this machine")
-    manifest = read_manifest(parts[0])
+    manifest = manifests.read_manifest(parts[0])
     for part in parts[1:]:
-        other = read_manifest(part)
-        if said := describe_differences(other, manifest):
+        other = manifests.read_manifest(part)
+        if said := manifests.describe_differences(other, manifest):
             raise DatasetError(f"{part} was made with other settings than {parts[0]}: {said}; only parts of one data set can be merged")
-        if said := describe_inputs(other.get(INPUTS, {}), manifest.get(INPUTS, {})):
+        if said := manifests.describe_inputs(other.get(manifests.INPUTS, {}), manifest.get(manifests.INPUTS, {})):
             raise DatasetError(f"{part} was made with other {said} than {parts[0]}; only parts of one data set can be merged")
     _check_folders(parts, out)
     config = _config(parts, manifest)
@@ -82,15 +66,19 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
     try:
         for part in parts:
             locks.append(lock_folder(part))  # noqa: PERF401 (those that are locked must be closed)
-        _fill(out, sources, config, encode_manifest(manifest))
+        _fill(out, sources, config, manifests.encode_manifest(manifest))
     except OSError as error:
         raise files.output_error(out, error) from error
     finally:
         for lock in locks:
             os.close(lock)
-    there = set(committed_episodes(out))
+    there = set(manifests.committed_episodes(out))
     missing = [index for each in layout.plan() for index in each if index not in there]
-    return Merged(len(there), missing, [line for part in parts if (line := describe_strays(part, layout, committed_episodes(part)))])
+    return Merged(
+        len(there),
+        missing,
+        [line for part in parts if (line := manifests.describe_strays(part, layout, manifests.committed_episodes(part)))],
+    )
 
 
 def _check_folders(parts: Sequence[Path], out: Path) -> None:
@@ -115,25 +103,29 @@ def _sources(parts: Sequence[Path], layout: DataLayout) -> dict[Path, Path]:
     an entry, an entry or a checksum list is damaged, or no part has a committed episode."""
     sources: dict[Path, Path] = {}
     for part in parts:
-        for entry in (CONSTANTS, *map(episode_entry, committed_episodes(part))):
-            checksums, known = read_checksums(part, entry), sources.setdefault(entry, part)
-            check_file_names(part, entry, checksums, layout)
+        for entry in (manifests.CONSTANTS, *map(manifests.episode_entry, manifests.committed_episodes(part))):
+            checksums, known = manifests.read_checksums(part, entry), sources.setdefault(entry, part)
+            manifests.check_file_names(part, entry, checksums, layout)
             if known is part:
                 continue
-            if read_checksums(known, entry) != checksums or read_entry(known, entry) != read_entry(part, entry):
+            if manifests.read_checksums(known, entry) != checksums or manifests.read_entry(known, entry) != manifests.read_entry(
+                part, entry
+            ):
                 raise DatasetError(f"{known} and {part} have different files for {entry.name}; only parts of one data set can be merged")
-    if not any(entry != CONSTANTS for entry in sources):
+    if not any(entry != manifests.CONSTANTS for entry in sources):
         raise DatasetError(f"{' and '.join(map(str, parts))} have no committed episode")
     return sources
 
 
 def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
     """Settings of the first part, with the maximum number of episodes over all parts, per split."""
-    configs = [read_settings(part, manifest) for part in parts]
+    configs = [manifests.read_settings(part, manifest) for part in parts]
     longest = [max(each, key=lambda split: split.episodes) for each in zip(*(config.splits for config in configs), strict=True)]
     episodes = sum(split.episodes for split in longest) or max(config.bake.episodes for config in configs)
     if episodes > MAX_EPISODES:
-        raise DatasetError(f"bake.episodes is {episodes} in the {CONFIG_FILE} of a part; allowed: up to {MAX_EPISODES}; correct it there")
+        raise DatasetError(
+            f"bake.episodes is {episodes} in the {manifests.CONFIG_FILE} of a part; allowed: up to {MAX_EPISODES}; correct it there"
+        )
     config = dataclasses.replace(configs[0].with_values({"bake.episodes": episodes}), splits=tuple(longest))
     for before, after in itertools.pairwise(config.splits):
         if after.first < before.first + before.episodes:
@@ -148,7 +140,7 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
     names: list[str] = []
     try:
         make_folder(work)
-        (work / ENTRIES).mkdir()
+        (work / manifests.ENTRIES).mkdir()
         lock = lock_folder(out)
         try:
             _stage(work, sources, config, manifest, lock)
@@ -172,12 +164,12 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
 def _stage(work: Path, sources: dict[Path, Path], config: Config, manifest: bytes, lock: int) -> None:
     """Fill an empty folder with the files of all entries, the entries, settings, manifest and indices."""
     for entry, part in sources.items():
-        size = sum(link_file(part / name, work / name) for name in read_checksums(part, entry))
+        size = sum(link_file(part / name, work / name) for name in manifests.read_checksums(part, entry))
         for suffix in (".sha256", ".json"):
             link_file(part / f"{entry}{suffix}", work / f"{entry}{suffix}")
-        if size != (read_entry(work, entry) or {}).get("bytes"):  # A power cut shortens what an unfinished bake has not flushed.
+        if size != (manifests.read_entry(work, entry) or {}).get("bytes"):  # A power cut shortens what an unfinished bake has not flushed.
             raise DatasetError(f"{part} has files of other sizes than {entry}.json says; resume its bake, or see `synpick-warp verify`")
-    files.write_atomically(work / CONFIG_FILE, config_to_toml(config).encode())
+    files.write_atomically(work / manifests.CONFIG_FILE, config_to_toml(config).encode())
     files.write_atomically(work / files.MANIFEST_FILE, manifest)
     needs = Needs.of(config)
     with WriterPool(config.bake.writers or count_cores(), needs.slot_bytes, lock) as pool:

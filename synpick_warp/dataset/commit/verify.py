@@ -11,19 +11,7 @@ from typing import NamedTuple
 
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.commit.manifest import (
-    CONSTANTS,
-    INDICES,
-    check_file_names,
-    check_frames,
-    check_listed_frames,
-    committed_episodes,
-    episode_entry,
-    read_checksums,
-    read_entry,
-    read_manifest,
-    read_settings,
-)
+from synpick_warp.dataset.commit import manifest as manifests
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.files import checksum
 from synpick_warp.system.hardware.cores import count_cores
@@ -66,15 +54,19 @@ def verify(folder: Path, threads: int | None = None, report: Report = ignore_pro
     ProcessError if processes cannot be started, or one died.
     """
     _read_config.cache_clear()  # Another data set may be there now.
-    manifest = read_manifest(folder)
-    episodes = committed_episodes(folder)
+    manifest = manifests.read_manifest(folder)
+    episodes = manifests.committed_episodes(folder)
     files = 0
     finished = False
     try:
-        read_settings(folder, manifest)
-        indices = read_entry(folder, INDICES)
+        manifests.read_settings(folder, manifest)
+        indices = manifests.read_entry(folder, manifests.INDICES)
         finished = indices is not None and indices["episodes"] == episodes
-        entries = [CONSTANTS, *map(episode_entry, episodes), *([INDICES] if indices else [])] if episodes or indices else []
+        entries = (
+            [manifests.CONSTANTS, *map(manifests.episode_entry, episodes), *([manifests.INDICES] if indices else [])]
+            if episodes or indices
+            else []
+        )
         total, size = _count_files(folder, entries)
         processes = max(1, total // _FILES_PER_PROCESS, size // _BYTES_PER_PROCESS)
         for checked in _check_entries(folder, entries, min(threads or count_cores(), processes)):
@@ -85,7 +77,7 @@ def verify(folder: Path, threads: int | None = None, report: Report = ignore_pro
     except (ConfigError, DatasetError) as error:
         return Verdict(str(error), len(episodes), files, finished)
     missing = sorted(set(indices["episodes"]) - set(episodes)) if indices else []
-    problem = f"{folder / episode_entry(missing[0])}.json is missing" if missing else ""
+    problem = f"{folder / manifests.episode_entry(missing[0])}.json is missing" if missing else ""
     return Verdict(problem, len(episodes), files, finished)
 
 
@@ -94,7 +86,7 @@ def _count_files(folder: Path, entries: Sequence[Path]) -> tuple[int, int]:
     files = size = 0
     for entry in entries:
         try:
-            content = read_entry(folder, entry)
+            content = manifests.read_entry(folder, entry)
         except DatasetError:
             continue
         if content is not None:
@@ -111,26 +103,26 @@ def _check_entries(folder: Path, entries: Sequence[Path], processes: int) -> Ite
 
 def _cached_reader() -> _Reader:
     """State of a process: `read_checksums` with the list that it read last; successive parts are usually of one entry."""
-    return lru_cache(maxsize=1)(read_checksums)
+    return lru_cache(maxsize=1)(manifests.read_checksums)
 
 
-def check_part(folder: Path, entry: Path, part: int = 0, parts: int = 1, read: _Reader = read_checksums) -> Checked:
+def check_part(folder: Path, entry: Path, part: int = 0, parts: int = 1, read: _Reader = manifests.read_checksums) -> Checked:
     """Task: check the checksums of one of `parts` equal parts of the files of a manifest entry, up to the first problem.
 
     Part 0 also checks, before, that the list has the file names that the settings imply, and after, an episode's number of frames.
     """
     checked = Checked(0, "")
     try:
-        known, content = read(folder, entry), read_entry(folder, entry) or {}
-        layout = DataLayout.of(_read_config(folder)) if part == 0 and entry != INDICES else None
+        known, content = read(folder, entry), manifests.read_entry(folder, entry) or {}
+        layout = DataLayout.of(_read_config(folder)) if part == 0 and entry != manifests.INDICES else None
         if layout is not None:
-            check_file_names(folder, entry, known, layout)
+            manifests.check_file_names(folder, entry, known, layout)
         first, end = (len(known) * (part + step) // parts for step in (0, 1))
         checked = check_files(folder, dict(islice(known.items(), first, end)), content.get("bytes"))
-        if layout is not None and entry != CONSTANTS and not checked.problem:
+        if layout is not None and entry != manifests.CONSTANTS and not checked.problem:
             row = content["row"]
-            check_listed_frames(folder, layout, row, known)
-            check_frames(folder, layout, row["episode"], row["frames"])
+            manifests.check_listed_frames(folder, layout, row, known)
+            manifests.check_frames(folder, layout, row["episode"], row["frames"])
     except (ConfigError, DatasetError) as error:
         return checked._replace(problem=str(error))
     return checked
@@ -139,7 +131,7 @@ def check_part(folder: Path, entry: Path, part: int = 0, parts: int = 1, read: _
 @lru_cache(maxsize=1)
 def _read_config(folder: Path) -> Config:
     """Read the settings of a data set, checked against its manifest."""
-    return read_settings(folder, read_manifest(folder))
+    return manifests.read_settings(folder, manifests.read_manifest(folder))
 
 
 def check_files(folder: Path, known: Mapping[str, str], limit: int | None = None) -> Checked:

@@ -20,19 +20,10 @@ from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Bop
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import EncodedView, SharedFiles
+from synpick_warp.exporters.bop import view as bop_view
 from synpick_warp.exporters.bop.outlines import trace_outlines
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages
-from synpick_warp.exporters.bop.view import (
-    ANNOTATIONS,
-    Keypoints,
-    ViewSettings,
-    annotation_block,
-    make_category_keys,
-    make_keypoints,
-    make_rle,
-    to_json,
-)
 from synpick_warp.exporters.writing.files import PARTIAL, open_folder, output_errors, sync_folder, write_synced
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -62,29 +53,33 @@ def annotation_file(split: str) -> Path:
     return FOLDER / "annotations" / f"instances_{split}.json"
 
 
-def write_categories(out: Path, names: Mapping[int, str], keypoints: Mapping[int, Keypoints]) -> None:
+def write_categories(out: Path, names: Mapping[int, str], keypoints: Mapping[int, bop_view.Keypoints]) -> None:
     """Write names and keypoints (or none) of the objects by obj_id, and the folders of the format."""
     with output_errors(out / CATEGORIES):
         for folder in (FOLDER, IMAGES, PARTS):
             (out / folder).mkdir(exist_ok=True)
-        extras = {obj_id: make_category_keys(points) for obj_id, points in keypoints.items()}
+        extras = {obj_id: bop_view.make_category_keys(points) for obj_id, points in keypoints.items()}
         named = [{"id": obj_id, "name": name, "supercategory": "object"} for obj_id, name in sorted(names.items())]
         categories = [category | extras.get(obj_id, {}) for category, obj_id in zip(named, sorted(names), strict=True)]
         (out / CATEGORIES).write_text(json.dumps(categories, indent=2) + "\n", encoding="ascii")
 
 
-def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
+def write_view(view: EncodedView, scene: Path, settings: bop_view.ViewSettings) -> None:
     """Write a view's image to the staging folder of its scene, and append its annotations there."""
     suffix, color = view.color
     with open_folder(scene) as folder:
         folder.write(f"{view.frame:06d}{suffix}", color)
-        folder.append(ANNOTATIONS, annotation_block(view.frame, (to_json(list(_make_annotations(view, settings))),)))
+        folder.append(
+            bop_view.ANNOTATIONS, bop_view.annotation_block(view.frame, (bop_view.to_json(list(_make_annotations(view, settings))),))
+        )
 
 
-def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dict[str, Any]]:
+def _make_annotations(view: EncodedView, settings: bop_view.ViewSettings) -> Iterator[dict[str, Any]]:
     """Annotations of a view's visible instances, without ids: box of the visible mask, segmentation, extra keys, keypoints."""
     width, height = settings.resolution
-    for pose, info, mask, points in zip(view.gt, view.gt_info, view.masks(), make_keypoints(view, settings.keypoints), strict=True):
+    for pose, info, mask, points in zip(
+        view.gt, view.gt_info, view.masks(), bop_view.make_keypoints(view, settings.keypoints), strict=True
+    ):
         box = mask.visible.box()
         if box is not None:
             left, top, right, bottom = box
@@ -95,7 +90,7 @@ def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dic
                 "bbox": [left, top, right - left + 1, bottom - top + 1],
                 "area": mask.visible.count,
                 "iscrowd": 0,
-                "segmentation": make_rle(mask.visible, height, width) if polygons is None else polygons,
+                "segmentation": bop_view.make_rle(mask.visible, height, width) if polygons is None else polygons,
                 **_make_extras(pose, info),
             } | points
 
@@ -112,14 +107,14 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Seque
     """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations for each frame, null for im_ids that sets of
     others leave out, and rename all to their places; raises OutputError if not all `frames` (im_id) of a scene have arrived."""
     for (scene, scene_id), own in zip(scenes, frames, strict=True):
-        with (scene / ANNOTATIONS).open("rb") as file:
+        with (scene / bop_view.ANNOTATIONS).open("rb") as file:
             blocks = AnnotationBlocks(file)
             blocks.check_frames(scene, own)
             known = set(blocks.frames)
             lines = [next(blocks.read(frame, 0, 1)) if frame in known else b"null" for frame in range(max(known, default=-1) + 1)]
         part = scene.with_name(f"{scene.name}.part")
         write_synced(part, b"".join(b"%s\n" % line for line in lines))
-        (scene / ANNOTATIONS).unlink()
+        (scene / bop_view.ANNOTATIONS).unlink()
         sync_folder(scene)
         part.rename(out / PARTS / f"{scene_id:06d}.jsonl")
         scene.rename(out / IMAGES / f"{scene_id:06d}")
@@ -160,7 +155,7 @@ def _write_annotations(
                 image_file.write((",\n" if images > 1 else "") + json.dumps(row))
                 for annotation in found:
                     annotations += 1
-                    text = to_json({"id": annotations, "image_id": images, **annotation}).decode()
+                    text = bop_view.to_json({"id": annotations, "image_id": images, **annotation}).decode()
                     file.write((",\n" if annotations > 1 else "") + text)
     head = {"info": {"description": f"synpick-warp, {split}"}, "licenses": [], "categories": msgspec.to_builtins(categories)}
     (out / place).parent.mkdir(exist_ok=True)

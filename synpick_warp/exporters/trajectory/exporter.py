@@ -21,22 +21,7 @@ from synpick_warp.configs.cell.cameras import WORLD
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Trajectory
 from synpick_warp.exporters.base import EpisodeExporter, ExportContext, SharedFiles, StagedEpisode
-from synpick_warp.exporters.trajectory.arrays import (
-    ARRANGEMENT,
-    ATTEMPTS,
-    CAMERAS,
-    CONSTANT_FILES,
-    EPISODE_GROUPS,
-    EPISODES,
-    FORMAT,
-    LABELS,
-    OBJECTS,
-    STEPS,
-    STORE,
-    TICKS,
-    GroupSpec,
-    TrajectoryArray,
-)
+from synpick_warp.exporters.trajectory import arrays as schema
 from synpick_warp.exporters.writing.files import output_errors, sync_file, sync_folder
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.scenes.types import FIRST_DISTRACTOR
@@ -47,14 +32,19 @@ from synpick_warp.views.frames import EpisodeEnd, TickBatch
 zarr.config.set(ZARR_THREADS)
 
 
-def add_group(parent: zarr.Group, name: str, doc: GroupSpec, attributes: Mapping[str, Any] | None = None) -> zarr.Group:
+def add_group(parent: zarr.Group, name: str, doc: schema.GroupSpec, attributes: Mapping[str, Any] | None = None) -> zarr.Group:
     """Create an empty group with its description, and the names of its coordinates if it has any, as attributes."""
     coordinates = {"coordinates": " ".join(doc.coordinates)} if doc.coordinates else {}
     return parent.create_group(name, attributes={"description": doc.description, **coordinates, **(attributes or {})})
 
 
 def add_table(
-    parent: zarr.Group, name: str, doc: GroupSpec, columns: Mapping[str, Any], level: int, attributes: Mapping[str, Any] | None = None
+    parent: zarr.Group,
+    name: str,
+    doc: schema.GroupSpec,
+    columns: Mapping[str, Any],
+    level: int,
+    attributes: Mapping[str, Any] | None = None,
 ) -> None:
     """Create a group and write its arrays, `columns` by name, in the schema's types; `level`: compression level of zstd."""
     group = add_group(parent, name, doc, attributes)
@@ -62,13 +52,15 @@ def add_table(
         add_array(group, column, spec, np.asarray(columns[column], spec.dtype), level)
 
 
-def add_array(group: zarr.Group, name: str, spec: TrajectoryArray, data: np.ndarray, level: int, chunk: int = 0, shard: int = 0) -> None:
+def add_array(
+    group: zarr.Group, name: str, spec: schema.TrajectoryArray, data: np.ndarray, level: int, chunk: int = 0, shard: int = 0
+) -> None:
     """Write an array of values, of the schema's shape, which are sliced one shard at a time; `level`: compression level of zstd.
 
     `chunk`: rows per chunk (compressed together), 0: all; `shard`: rows per shard (file), a multiple of `chunk`, 0: it is not sharded.
     """
     attributes: dict[str, Any] = {"units": spec.unit, "description": spec.description}
-    labels = {dim: list(LABELS[dim]) for dim in spec.dims if dim in LABELS}
+    labels = {dim: list(schema.LABELS[dim]) for dim in spec.dims if dim in schema.LABELS}
     if labels:
         attributes["labels"] = labels
     if spec.codes:
@@ -105,10 +97,10 @@ def chunk_layout(settings: Trajectory, ticks: int, rows_per_tick: int) -> tuple[
 
 def write_constants(context: ExportContext) -> None:
     """Write the store's root, the groups of objects and cameras, and the group of episodes, replacing existing ones (CONSTANT_FILES)."""
-    store, physics, level = context.out / STORE, context.settings.physics, context.settings.trajectory.level
-    for folder in (store, store / EPISODES):
+    store, physics, level = context.out / schema.STORE, context.settings.physics, context.settings.trajectory.level
+    for folder in (store, store / schema.EPISODES):
         folder.mkdir(exist_ok=True)
-    for place in (context.out / name for name in CONSTANT_FILES):
+    for place in (context.out / name for name in schema.CONSTANT_FILES):
         if place.is_dir():
             shutil.rmtree(place)
         else:
@@ -121,8 +113,8 @@ def write_constants(context: ExportContext) -> None:
         store,
         attributes={
             "description": "Physics of a synpick-warp data set. SI units; the world's origin is the centre of the"
-            f" {context.settings.bins[0].noun}'s inner floor, z up. Episodes are in {EPISODES}, named by number.",
-            "format": FORMAT,
+            f" {context.settings.bins[0].noun}'s inner floor, z up. Episodes are in {schema.EPISODES}, named by number.",
+            "format": schema.FORMAT,
             "seed": context.settings.bake.seed,
             "step": physics.step,
             "steps_per_tick": physics.steps_per_tick,
@@ -133,15 +125,15 @@ def write_constants(context: ExportContext) -> None:
         },
     )
     entries, cameras = context.catalog.entries, context.cameras
-    columns = {name: [entry.obj_id if name == "object_id" else getattr(entry, name) for entry in entries] for name in OBJECTS.arrays}
-    add_table(root, "objects", OBJECTS, columns, level, {"names": [entry.name for entry in entries]})
+    columns = {name: [entry.obj_id if name == "object_id" else getattr(entry, name) for entry in entries] for name in schema.OBJECTS.arrays}
+    add_table(root, "objects", schema.OBJECTS, columns, level, {"names": [entry.name for entry in entries]})
     known: dict[str, list[Any]] = {"fixed_to": [camera.fixed_to for camera in cameras], "shutter": [camera.shutter for camera in cameras]}
     known["distortion"] = [camera.distortion or None for camera in cameras]
     usual = {"fixed_to": WORLD, "distortion": None, "shutter": (0.0, 0.0)}
     unusual = {name: values for name, values in known.items() if any(value != usual[name] for value in values)}
-    columns = {name: [getattr(camera, name) for camera in cameras] for name in CAMERAS.arrays}
-    add_table(root, "cameras", CAMERAS, columns, level, unusual)
-    add_group(root, EPISODES, GroupSpec("One group an episode, named by its number with six digits."))
+    columns = {name: [getattr(camera, name) for camera in cameras] for name in schema.CAMERAS.arrays}
+    add_table(root, "cameras", schema.CAMERAS, columns, level, unusual)
+    add_group(root, schema.EPISODES, schema.GroupSpec("One group an episode, named by its number with six digits."))
 
 
 SPOOL_ROWS = 32
@@ -150,7 +142,7 @@ ROWS = "rows"
 """Name of the spool file in an episode's staging folder."""
 _OWN = ("object_id", "pose", "fixture_pose", "fixture_visible", "time")
 """Fields that every `TickBatch` has."""
-_TABLES = {"ticks": TICKS.arrays, "steps": STEPS.arrays}
+_TABLES = {"ticks": schema.TICKS.arrays, "steps": schema.STEPS.arrays}
 _COMPUTED = "steps/time"
 """Array that rows omit: it is computed from the tick's time when the group is written."""
 
@@ -175,15 +167,15 @@ def row_type(ticks: tuple[str, ...], steps: tuple[str, ...], instances: int, ste
 
 def spool_bytes(instances: int, steps_per_tick: int, has_steps: bool) -> int:
     """Maximum size of the rows of one task [B]; `instances`: capacity of a world, `has_steps`: whether steps are recorded."""
-    steps = tuple(STEPS.arrays) if has_steps else ()
-    return SPOOL_ROWS * row_type(tuple(TICKS.arrays), steps, instances, steps_per_tick).itemsize
+    steps = tuple(schema.STEPS.arrays) if has_steps else ()
+    return SPOOL_ROWS * row_type(tuple(schema.TICKS.arrays), steps, instances, steps_per_tick).itemsize
 
 
 def batch_type(batch: TickBatch, instances: int, steps_per_tick: int) -> np.dtype:
     """Structured type of rows that hold a batch's arrays, of an episode with this number of instances; raises ValueError if the batch has
     arrays of steps that the schema lacks; such arrays of ticks are left out."""
-    ticks = tuple(name for name in TICKS.arrays if name in _OWN or name in batch.tick)
-    steps = tuple(name for name in STEPS.arrays if name in batch.steps)
+    ticks = tuple(name for name in schema.TICKS.arrays if name in _OWN or name in batch.tick)
+    steps = tuple(name for name in schema.STEPS.arrays if name in batch.steps)
     if len(steps) != len(batch.steps):
         raise ValueError(f"steps have {set(batch.steps) - set(steps)}, which nothing describes")
     return row_type(ticks, steps, instances, steps_per_tick)
@@ -263,10 +255,10 @@ def write_episode(
         "mass": np.array([masses.get(int(obj_id), np.nan) for obj_id in episode.object_id]),
         "drop_pose": missing if episode.drop_pose is None else episode.drop_pose,
     }
-    add_table(group, "arrangement", ARRANGEMENT, arrangement, level)
+    add_table(group, "arrangement", schema.ARRANGEMENT, arrangement, level)
     arrays = make_attempt_arrays([json.loads(line) for line in attempts], len(episode.object_id))
     arrays["record"] = np.frombuffer("".join(attempts).encode(), np.uint8)
-    add_table(group, "attempts", ATTEMPTS, arrays, level)
+    add_table(group, "attempts", schema.ATTEMPTS, arrays, level)
     for path in sorted((folder / GROUP).rglob("*")):
         (sync_folder if path.is_dir() else sync_file)(path)
     sync_folder(folder / GROUP)
@@ -279,15 +271,15 @@ def _write_rows(group: zarr.Group, rows: np.ndarray, settings: ExportSettings) -
     steps = settings.physics.steps_per_tick
     for name, rows_per_tick in (("ticks", 1), ("steps", steps)):
         names = rows.dtype.names or ()
-        given = {array: rows[field_name(name, array)] for array in EPISODE_GROUPS[name].arrays if field_name(name, array) in names}
+        given = {array: rows[field_name(name, array)] for array in schema.EPISODE_GROUPS[name].arrays if field_name(name, array) in names}
         if name == "steps" and given:
             # The time at each step's end, counted back from the tick's time.
             given["time"] = rows["ticks/time"][:, None] - settings.physics.step * np.arange(steps - 1, -1, -1)
         if not given:
             continue
-        target = add_group(group, name, EPISODE_GROUPS[name])
+        target = add_group(group, name, schema.EPISODE_GROUPS[name])
         chunk, shard = chunk_layout(settings.trajectory, len(rows), rows_per_tick)
-        for array, spec in EPISODE_GROUPS[name].arrays.items():
+        for array, spec in schema.EPISODE_GROUPS[name].arrays.items():
             if array in given:
                 values = given[array]
                 data = _FlattenedSteps(values) if name == "steps" else values
@@ -316,7 +308,7 @@ def make_attempt_arrays(attempts: Sequence[Mapping[str, Any]], instances: int) -
     ticks = max((len(attempt["peak_force"]) for attempt in attempts), default=0)
     sizes = {"attempt": len(attempts), "instance": instances, "lift_tick": ticks, "byte": 0}
     columns = {}
-    for name, spec in ATTEMPTS.arrays.items():
+    for name, spec in schema.ATTEMPTS.arrays.items():
         dtype = np.dtype(spec.dtype)
         missing = {"f": np.nan, "i": -1}.get(dtype.kind, 0)
         column = columns[name] = np.full(spec.shape(sizes), missing, dtype)
@@ -359,12 +351,12 @@ class TrajectoryExporter(EpisodeExporter[SpooledEpisode]):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        return SharedFiles(CONSTANT_FILES, (), (STORE / EPISODES, STORE))
+        return SharedFiles(schema.CONSTANT_FILES, (), (schema.STORE / schema.EPISODES, schema.STORE))
 
     def write_constants(self) -> list[Path]:
-        with output_errors(self._context.out / STORE):
+        with output_errors(self._context.out / schema.STORE):
             write_constants(self._context)
-        return list(CONSTANT_FILES)
+        return list(schema.CONSTANT_FILES)
 
     def write_ticks(self, batch: TickBatch) -> None:
         indices = batch.episode.tolist()
@@ -372,7 +364,7 @@ class TrajectoryExporter(EpisodeExporter[SpooledEpisode]):
         self._context.pool.submit_all(self._spool(batch, episodes))
 
     def places(self, episode: int) -> tuple[Path]:
-        return (STORE / EPISODES / f"{episode:06d}",)
+        return (schema.STORE / schema.EPISODES / f"{episode:06d}",)
 
     def _make_content(self, batch: TickBatch, world: int, _: Path) -> SpooledEpisode:
         """What the first tick of an episode tells, that of a world of a batch."""

@@ -29,6 +29,6 @@ def measure_meshes(rows: tuple[BinRow, ...], gripper: Gripper) -> dict[str, Any]
         return {}
     # Readers of meshes take a while to import.
     from synpick_warp.scenes.bin_meshes.reading import measure_bins
-    from synpick_warp.scenes.tool_bodies import measure_tool
+    from synpick_warp.scenes.props import measure_tool
 
     return {**measure_bins(rows), **measure_tool(gripper)}
