@@ -26,8 +26,7 @@ from synpick_warp.dataset.commit import manifest as manifests
 from synpick_warp.errors import ConfigError, OutputError, StoreError, SynpickError
 from synpick_warp.system import clock
 from synpick_warp.system.inputs.files import MAX_JSON, MAX_TOML, decode_json
-from synpick_warp.system.stores.opening import CONTROL, Probe, open_store
-from synpick_warp.system.stores.store import SMALL, Store
+from synpick_warp.system.stores.store import CONTROL, SMALL, Probe, Store, open_store
 
 BLOCK = 1000
 """Episodes whose done marks are listed at a time, from the first key to the last: within a block all numbers have as many digits."""

@@ -30,8 +30,7 @@ from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreErr
 from synpick_warp.system.inputs.files import MAX_JSON, MAX_TOML, decode_json, make_folder, path_inside, read_file
 from synpick_warp.system.inputs.urls import SCHEMES
 from synpick_warp.system.progress import Report, ignore_progress
-from synpick_warp.system.stores.opening import CONTROL, open_store
-from synpick_warp.system.stores.store import SizeError
+from synpick_warp.system.stores.store import CONTROL, SizeError, open_store
 
 CACHE_BYTES = 8 << 30
 """Default limit of an opened set's cache of episodes [B]; the least recently used are evicted."""

@@ -44,8 +44,7 @@ from synpick_warp.factory.episodes import BakeSummary, EpisodeSource, count_writ
 from synpick_warp.system import clock
 from synpick_warp.system.inputs.files import MAX_JSON, make_folder
 from synpick_warp.system.progress import ForwardingProgress, Progress
-from synpick_warp.system.stores.opening import open_store, probe
-from synpick_warp.system.stores.store import SMALL
+from synpick_warp.system.stores.store import SMALL, open_store, probe
 
 AHEAD = 256
 """Index files that are requested together, and then unpacked in the order of their episodes."""

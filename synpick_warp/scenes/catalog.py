@@ -1,10 +1,19 @@
-"""The object catalog of a bake: models from a folder or the embedded ones, validated, with collision shapes and mass properties."""
+"""The object catalog of a bake: models from a folder or the embedded ones, validated, with collision shapes and mass properties; and a
+cache of detected symmetries in the user's cache folder.
 
+The cache's key is a hash of the mesh, the tolerance and the source code of the detection: symmetries of a part are detected once, and again
+after the code has changed.
+"""
+
+import contextlib
+import hashlib
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import scipy
 from trimesh.bounds import oriented_bounds
 
 from synpick_warp.configs.cell.bins import BinSizes
@@ -17,15 +26,45 @@ from synpick_warp.scenes.assets.meshes import STEP_SUFFIXES, MeshOptions, connec
 from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
 from synpick_warp.scenes.assets.models_info import FileModelInfo, check_against_mesh, read_models_info
 from synpick_warp.scenes.collision.hulls import hull_size, is_concave, mass_properties
-from synpick_warp.scenes.collision.shapes import ShapeRecipe, collision_shapes, default_cache_dir
+from synpick_warp.scenes.collision.shapes import ShapeRecipe, collision_shapes, default_cache_dir, write_arrays
 from synpick_warp.scenes.embedded.objects import procedural_objects, solids
 from synpick_warp.scenes.props import make_props
-from synpick_warp.scenes.symmetries.cache import cached_symmetries
-from synpick_warp.scenes.symmetries.detection import add_symmetries
+from synpick_warp.scenes.symmetries import detection, surface
+from synpick_warp.scenes.symmetries.detection import Symmetries, Turn, add_symmetries, find_symmetries
 from synpick_warp.scenes.symmetries.surface import look_alike, shape_profile
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, RawObject, TriangleMesh
+from synpick_warp.system import linear_algebra
+from synpick_warp.system.hardware.kernels import user_cache
+from synpick_warp.system.inputs.files import check_regular_file
 from synpick_warp.system.linear_algebra import norm
 from synpick_warp.system.processes.isolation import Limits
+
+MAX_FILE = 1 << 22
+"""Largest file that is read [bytes]: 20,000 symmetries, more than an object can have."""
+
+
+def cached_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, tolerance: float, folder: Path | None = None) -> Symmetries:
+    """Symmetries of a mesh by `find_symmetries`, or those that it found before. `folder`: cache folder, which need not exist nor be
+    writable; None: that of the user."""
+    given = (diameter, tolerance, vertices.shape, vertices.dtype, faces.shape, faces.dtype, np.__version__, scipy.__version__)
+    digest = hashlib.sha256(repr(given).encode())
+    for part in (*(Path(str(module.__file__)).read_bytes() for module in (detection, surface, linear_algebra)), vertices, faces):
+        digest.update(part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes())
+    file = (folder or (user_cache() or Path(os.devnull)) / "synpick-warp" / "symmetries") / f"{digest.hexdigest()}.npz"
+    with contextlib.suppress(Exception):  # A damaged file raises nearly anything; whatever it is, the symmetries are found again.
+        check_regular_file(file, MAX_FILE, CatalogError)
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+            turns = [Turn(row[:3], row[3:6], int(row[6]), float(row[7])) for row in data["turns"].reshape(-1, 8)]
+            continuous, missed = turns[: int(data["continuous"])], turns[int(data["continuous"]) :]
+            return Symmetries(data["discrete"].reshape(-1, 4, 4), data["deviations"], tuple(continuous), missed[0] if missed else None)
+    found = find_symmetries(vertices, faces, diameter, tolerance)
+    with contextlib.suppress(OSError):  # Without a cache they are found each time.
+        turns = [*found.continuous, *([] if found.missed is None else [found.missed])]
+        rows = np.array([(*turn.axis, *turn.point, turn.fold, turn.deviation) for turn in turns], np.float64)
+        count = np.array(len(found.continuous))
+        write_arrays(file, turns=rows, continuous=count, discrete=found.discrete, deviations=found.deviations)
+    return found
+
 
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.
 _MIN_DIAMETER = 2e-3

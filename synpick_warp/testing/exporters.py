@@ -26,8 +26,7 @@ from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.testing import box_views
-from synpick_warp.testing.box_views import batches, cameras, catalog, ends, ticks
-from synpick_warp.testing.picks import pick_batch
+from synpick_warp.testing.box_views import batches, cameras, catalog, ends, pick_batch, ticks
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
 FRAMES = 3

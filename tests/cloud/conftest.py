@@ -12,9 +12,9 @@ from uuid import uuid4
 import pytest
 
 from synpick_warp.system.hardware.cores import SETUP
-from synpick_warp.system.stores import opening
+from synpick_warp.system.stores import store
 from synpick_warp.system.stores import store as store_module
-from synpick_warp.system.stores.opening import CONTROL, open_store
+from synpick_warp.system.stores.store import CONTROL, open_store
 from tests.builders import once
 from tests.harness import scripted_bake
 from tests.harness.scripted_bake import tiny
@@ -103,9 +103,9 @@ def memory(monkeypatch: pytest.MonkeyPatch) -> str:
 
 def keep_in_memory(monkeypatch: pytest.MonkeyPatch) -> str:
     """A new bucket; all prefixes below it are stores in memory, each by itself."""
-    bucket, stores, real = f"s3://memory-{uuid4().hex[:12]}", {}, opening.connect
+    bucket, stores, real = f"s3://memory-{uuid4().hex[:12]}", {}, store.connect
     kind = pytest.importorskip("obstore.store").MemoryStore
-    monkeypatch.setattr(opening, "connect", lambda url: stores.setdefault(url, kind()) if url.startswith(bucket) else real(url))
+    monkeypatch.setattr(store, "connect", lambda url: stores.setdefault(url, kind()) if url.startswith(bucket) else real(url))
     return bucket
 
 

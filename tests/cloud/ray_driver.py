@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.console import Console
 
 from synpick_warp.cli.display import make_progress
-from synpick_warp.cloud.ray_engine import bake_with_ray
 from synpick_warp.cloud.run import Crew, Job
+from synpick_warp.cloud.workers import bake_with_ray
 from tests.cloud.claiming_worker import bake_or_die
 from tests.harness.scripted_bake import tiny
 

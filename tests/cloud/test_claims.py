@@ -19,7 +19,7 @@ from synpick_warp.cloud.workers import bake_with_devices
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.system import clock
 from synpick_warp.system.progress import SilentProgress
-from synpick_warp.system.stores.opening import Probe, open_store
+from synpick_warp.system.stores.store import Probe, open_store
 from tests.builders import mistake
 from tests.cloud.conftest import files, stored
 from tests.harness import scripted_bake

@@ -18,7 +18,7 @@ from synpick_warp.cli.main import main
 from synpick_warp.cloud import reading
 from synpick_warp.dataset.pytorch import Views
 from synpick_warp.errors import DatasetError, StoreError, SynpickError
-from synpick_warp.system.stores.opening import open_store
+from synpick_warp.system.stores.store import open_store
 from tests.builders import mistake, run
 from tests.cloud.conftest import files
 

@@ -30,9 +30,8 @@ from synpick_warp.cloud.run import Crew
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.system.inputs.urls import parse_place, resolve_word
 from synpick_warp.system.progress import SilentProgress
-from synpick_warp.system.stores import opening
 from synpick_warp.system.stores import store as store_module
-from synpick_warp.system.stores.opening import Probe, open_store, probe
+from synpick_warp.system.stores.store import Probe, open_store, probe
 from tests.builders import mistake
 from tests.cloud.conftest import files, stored
 from tests.harness import scripted_bake
@@ -115,7 +114,7 @@ def test_requests_are_repeated_while_the_store_fails(server, prefix, fault):
 
 
 def test_a_store_that_does_not_answer_in_time_is_asked_again(server, prefix, monkeypatch):
-    monkeypatch.setattr(opening, "TIMEOUT", 1)
+    monkeypatch.setattr(store_module, "TIMEOUT", 1)
     gate, count = threading.Event(), itertools.count()
     server.fault = lambda method, path: gate.wait(1.5) and None if next(count) == 0 else None
     store = open_store(prefix)

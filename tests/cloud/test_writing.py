@@ -16,7 +16,7 @@ from synpick_warp.dataset.commit.manifest import INPUTS, OBJECT, encode_manifest
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
 from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.progress import SilentProgress
-from synpick_warp.system.stores.opening import Probe, open_store
+from synpick_warp.system.stores.store import Probe, open_store
 from tests.builders import mistake
 from tests.cloud.conftest import files, stored
 from tests.harness import scripted_bake

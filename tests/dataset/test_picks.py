@@ -28,9 +28,8 @@ from synpick_warp.dataset.view import find_pixels, mean_by_candidate
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.picks import FOLDER, PicksExporter, check_schema, from_table, make_table, pick_files
-from synpick_warp.testing.box_views import cameras, config
+from synpick_warp.testing.box_views import EACH, REPEATS, cameras, config, pick_batch
 from synpick_warp.testing.exporters import export
-from synpick_warp.testing.picks import EACH, REPEATS, pick_batch
 from synpick_warp.views.picks import COLUMNS, STATES, are_sorted, make_rows, sort_rows
 from tests.builders import mistake, run
 from tests.harness import scripted_bake

@@ -36,9 +36,8 @@ from synpick_warp.exporters.registry import Exporters, Needs, load_exporter_clas
 from synpick_warp.exporters.trajectory.arrays import CONSTANT_GROUPS, EPISODE_GROUPS
 from synpick_warp.factory.episodes import EpisodeOutcome
 from synpick_warp.testing import box_views
-from synpick_warp.testing.box_views import config
+from synpick_warp.testing.box_views import EACH, REPEATS, config, pick_batch
 from synpick_warp.testing.exporters import ExporterContract, export, exporting, feed, finish
-from synpick_warp.testing.picks import EACH, REPEATS, pick_batch
 from synpick_warp.views.frames import EpisodeEnd
 from synpick_warp.views.layers import LAYER_TABLE
 from synpick_warp.views.picks import COLUMNS, ORDER, STATES, PickBatch, make_rows

@@ -19,7 +19,7 @@ from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome, EpisodeSo
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.system.progress import Progress
 from synpick_warp.testing import box_views
-from synpick_warp.testing.picks import pick_batch
+from synpick_warp.testing.box_views import pick_batch
 from synpick_warp.views.frames import EpisodeEnd
 from tests.worlds import trajectories
 from tests.worlds.trajectories import seen_object

@@ -19,8 +19,8 @@ from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import bake_vertex_colors, decode_texture, linear_to_srgb, rgb8, srgb_to_linear
-from synpick_warp.scenes.assets.mesh_parts import smooth_normals
 from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
+from synpick_warp.scenes.assets.normals import smooth_normals
 from synpick_warp.scenes.types import MAP_CENTER
 from tests.builders import refusal
 from tests.worlds import model_files

@@ -15,10 +15,10 @@ from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.configs.schema import ObjectRow
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared import write_models
+from synpick_warp.scenes import catalog
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.collision.hulls import hull_size
-from synpick_warp.scenes.symmetries import cache
 from synpick_warp.scenes.symmetries.detection import close_group, find_element, find_symmetries
 from synpick_warp.scenes.symmetries.surface import SampledSurface
 from tests.builders import refusal
@@ -289,7 +289,7 @@ def test_detected_symmetries_reach_models_info_and_evaluation(tmp_path, name, me
 def test_symmetries_are_found_once_for_a_mesh_and_a_tolerance(tmp_path, monkeypatch):
     """What is read has the bits of what was found; a damaged file is no error, and neither is a folder that cannot be written."""
     found, block, disc = [], MAKE.box((0.03, 0.04, 0.05)), MAKE.cylinder(0.02, 0.01, sections=12)
-    monkeypatch.setattr(cache, "find_symmetries", lambda *given: found.append(find_symmetries(*given)) or found[-1])
+    monkeypatch.setattr(catalog, "find_symmetries", lambda *given: found.append(find_symmetries(*given)) or found[-1])
     folder = tmp_path / "new"
     given = [(body.vertices, body.faces, 0.1, tolerance) for body, tolerance in ((block, 0.003), (disc, 0.003), (block, 0.002))]
 
@@ -298,12 +298,12 @@ def test_symmetries_are_found_once_for_a_mesh_and_a_tolerance(tmp_path, monkeypa
         numbers = [(*turn.axis.tolist(), *turn.point.tolist(), turn.fold, turn.deviation) for turn in turns]
         return found.discrete.tobytes(), found.deviations.tobytes(), found.discrete.shape, len(found.continuous), numbers
 
-    first, second = ([bits(cache.cached_symmetries(*each, folder)) for each in given] for _ in range(2))
+    first, second = ([bits(catalog.cached_symmetries(*each, folder)) for each in given] for _ in range(2))
     assert first == second == [bits(each) for each in found]
     assert len(list(folder.iterdir())) == 3
     assert all([found[0].discrete.size, found[1].continuous, found[1].missed])
     for file in folder.iterdir():
         file.write_bytes(file.read_bytes()[:-60])
-    assert bits(cache.cached_symmetries(*given[0], folder)) == first[0]
-    assert bits(cache.cached_symmetries(*given[0], Path("/dev/null/none"))) == first[0]
+    assert bits(catalog.cached_symmetries(*given[0], folder)) == first[0]
+    assert bits(catalog.cached_symmetries(*given[0], Path("/dev/null/none"))) == first[0]
     assert len(found) == 5

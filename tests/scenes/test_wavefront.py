@@ -15,8 +15,9 @@ from trimesh.exchange.gltf import export_gltf
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared import write_models
-from synpick_warp.scenes.assets.mesh_parts import clip_ears, crease_normals, find_concave, smooth_normals
+from synpick_warp.scenes.assets.mesh_parts import clip_ears, find_concave
 from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
+from synpick_warp.scenes.assets.normals import crease_normals, smooth_normals
 from tests.twins.layers import render_layers
 from tests.worlds.model_files import exported, load_models, picture, put, read_told, texels
 from tests.worlds.shapes import camera, entry

@@ -22,8 +22,7 @@ from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
 from synpick_warp.system import clock
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores import store
-from synpick_warp.system.stores.opening import Probe
-from synpick_warp.system.stores.store import Store
+from synpick_warp.system.stores.store import Probe, Store
 from tests.harness.scripted_bake import tiny
 from tests.simulation.faulty_store import DELAYED, LOST, REFUSED, FaultyStore, Write
 from tests.simulation.scheduler import START, Process, Simulation

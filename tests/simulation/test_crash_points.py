@@ -25,7 +25,7 @@ from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing import files as checksums
 from synpick_warp.system.progress import SilentProgress
-from synpick_warp.system.stores.opening import CONTROL, Probe
+from synpick_warp.system.stores.store import CONTROL, Probe
 from tests.builders import once
 from tests.cloud.conftest import files
 from tests.harness import scripted_bake

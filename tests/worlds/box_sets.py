@@ -12,9 +12,8 @@ from synpick_warp.dataset.commit.manifest import CONFIG_FILE, ENTRIES, MANIFEST_
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.picks import PicksExporter
 from synpick_warp.factory.episodes import EpisodeOutcome
-from synpick_warp.testing.box_views import config
+from synpick_warp.testing.box_views import config, pick_batch
 from synpick_warp.testing.exporters import FRAMES, export
-from synpick_warp.testing.picks import pick_batch
 from synpick_warp.views.frames import EpisodeEnd
 from tests.worlds import trajectories
 

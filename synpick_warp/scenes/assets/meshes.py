@@ -31,7 +31,8 @@ from synpick_warp.scenes.assets.asset_files import (
     reading_as,
 )
 from synpick_warp.scenes.assets.gltf.parts import read_gltf
-from synpick_warp.scenes.assets.mesh_parts import DEFAULT_CREASE, MeshPart, check_indices, crease_normals, smooth_normals
+from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices
+from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
 from synpick_warp.scenes.assets.wavefront import read_obj
 from synpick_warp.scenes.types import BLACK, OPAQUE, TriangleMesh
