@@ -14,8 +14,9 @@ from pathlib import Path
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.bop.layout import KEYED, KEYS, SHARD, Listing, SceneRef
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.files import MAX_JSON, decode_json, list_members, read_file
+from synpick_warp.system.inputs.files import MAX_JSON, decode_json, read_file
 from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE
+from synpick_warp.system.inputs.tar_files import list_members
 
 SUFFIXES = ("png", "jpg", "jpeg", "tif", "tiff")
 """File formats of images that BOP data sets have, the preferred one first."""

@@ -37,7 +37,7 @@ from synpick_warp.exporters.writing.files import (
 from synpick_warp.exporters.writing.notes import describe_lenses
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.exporters.writing.rle import Runs
-from synpick_warp.system.inputs.files import list_members
+from synpick_warp.system.inputs.tar_files import list_members
 
 MAX_SHARD_VIEWS = 1000
 """Maximum number of views in a shard, as in the toolkit (convert_imagewise_to_webdataset.py)."""

@@ -1,5 +1,4 @@
-"""Input files: bounded reads, paths inside a folder, JSON and TOML; members of tar files (webdataset shards), listed by their headers
-alone.
+"""Input files: bounded reads, paths inside a folder, JSON and TOML.
 
 Reads take regular files up to a size limit, and never block on a pipe or read a device. Names read from a file are resolved inside a folder
 (prevention of path traversal, CWE-22). JSON is decoded with a schema: msgspec types, with path and position of the first mismatch in the
@@ -11,16 +10,14 @@ import codecs
 import os
 import re
 import stat
-import tarfile
 import tomllib
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
-from synpick_warp.errors import DatasetError, SynpickError
-from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE
+from synpick_warp.errors import SynpickError
 
 _FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
 _BLOCK = 1 << 20
@@ -192,55 +189,3 @@ def read_toml(path: Path, error: type[SynpickError]) -> dict[str, Any]:
     except ValueError as fault:
         text = str(fault)
         raise error(f"{path} is not valid TOML: {text[:1].lower()}{text[1:]}") from None
-
-
-MAX_SHARD = 2**44
-"""Largest shard [bytes]: the limit of a file on ext4."""
-_EXTENDED = (tarfile.XHDTYPE, tarfile.XGLTYPE)
-_MAX_EXTENDED = 2**16
-"""Largest extended header that is looked at [bytes]; one of times has some 30."""
-_CHANGES = re.compile(rb"\d+ (?:path|size|GNU\.sparse[^=]*)=")
-"""Records of an extended header that say otherwise than the member's own header."""
-_ADVICE = "restore the file, or bake the data set again"
-
-
-def list_members(shard: Path, advice: str = _ADVICE, *, extended: bool = False) -> list[tuple[str, int, int]]:
-    """List the members of a tar file: name, offset and size [B]. Only headers are read; members must be regular files, as in shards.
-
-    Python's tarfile calls itself for each extended header, and so ends in a RecursionError on a chain of them. `shard`: the file. `advice`:
-    what to do if it is damaged. `extended`: whether extended headers (POSIX.1-2001) are passed over, which shards of others have for times
-    of fractions of a second; those that rename or resize a member are never taken. Raises DatasetError: the file cannot be read, is
-    truncated, or has another member: a link, a device, a sparse file, an extended header."""
-    check_regular_file(shard, MAX_SHARD, DatasetError)
-    members = []
-    try:
-        with shard.open("rb") as file:
-            end = shard.stat().st_size
-            while any(block := file.read(tarfile.BLOCKSIZE)):
-                info = tarfile.TarInfo.frombuf(block, "utf-8", "strict")
-                start = file.tell()
-                if (
-                    extended
-                    and info.type in _EXTENDED
-                    and info.size <= _MAX_EXTENDED
-                    and not _CHANGES.search(_read_blocks(file, info.size))
-                ):
-                    continue
-                if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE):
-                    raise DatasetError(f"{shard} has a member at byte {start - len(block)} that is not a regular file; {advice}")
-                if not 0 <= info.size <= min(MAX_IMAGE_FILE, end - start):
-                    raise DatasetError(
-                        f"{shard} is damaged: the member at byte {start - len(block)} has {describe_bytes(info.size)}; {advice}"
-                    )
-                members.append((info.name, start, info.size))
-                file.seek(start + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
-    except OSError as error:
-        raise DatasetError(f"{shard} cannot be read: {error.strerror}") from None
-    except (tarfile.TarError, ValueError) as error:  # Names that are not UTF-8 are ValueErrors.
-        raise DatasetError(f"{shard} is damaged: {error}; {advice}") from None
-    return members
-
-
-def _read_blocks(file: BinaryIO, size: int) -> bytes:
-    """Read the content of a tar member, and the padding of its last block."""
-    return file.read(-(-size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)

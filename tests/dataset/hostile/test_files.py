@@ -31,8 +31,8 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.bop.shards import ShardsExporter, key_lines
 from synpick_warp.exporters.trajectory.arrays import STEPS
-from synpick_warp.system.inputs.files import list_members
 from synpick_warp.system.inputs.image_files import decode_image, image_size
+from synpick_warp.system.inputs.tar_files import list_members
 from synpick_warp.testing.exporters import LENSES
 from tests.harness.hostile import fuzz_examples, places, replaced
 from tests.worlds import trajectories
