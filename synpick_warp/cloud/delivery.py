@@ -19,7 +19,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from synpick_warp.cloud.claims import INDEX, LeaseLostError, Ledger
+from synpick_warp.cloud.claims import LeaseLostError
+from synpick_warp.cloud.ledger import INDEX, Ledger
 from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.dataset.commit.manifest import CONSTANTS, MANIFEST_FILE, committed_episodes, episode_entry, read_checksums, read_entry
 from synpick_warp.dataset.commit.writing import list_lines

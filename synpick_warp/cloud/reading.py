@@ -19,8 +19,8 @@ from typing import IO, Any
 
 import msgspec
 
-from synpick_warp.cloud.claims import ENTRY
 from synpick_warp.cloud.delivery import FILES_AT_ONCE
+from synpick_warp.cloud.ledger import ENTRY
 from synpick_warp.configs.dataset import episode_range
 from synpick_warp.dataset.annotations import ADVICE, Index
 from synpick_warp.dataset.commit import manifest as manifests

@@ -15,21 +15,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from synpick_warp.cloud.claims import (
-    CLAIMS,
-    FINISHED,
-    FINISHING,
-    INDEX,
-    LEASE,
-    Chunk,
-    Chunks,
-    Claims,
-    LeaseLostError,
-    Ledger,
-    open_claims,
-    plan_chunks,
-)
+from synpick_warp.cloud.claims import CLAIMS, LEASE, Chunk, Chunks, Claims, LeaseLostError, open_claims, plan_chunks
 from synpick_warp.cloud.delivery import FILES_AT_ONCE, MAX_BUNDLE, Delivery, WatchedProgress, send_file, unpack_bundle
+from synpick_warp.cloud.ledger import FINISHED, FINISHING, INDEX, Ledger
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.configs.schema import Config

@@ -41,9 +41,10 @@ from synpick_warp.stages.perception.images import allocate_batch, count_views
 from synpick_warp.stages.perception.perceive import allocate_votes
 from synpick_warp.stages.render.cameras import allocate_lenses
 from synpick_warp.stages.render.looks import allocate_materials, materials_of_view
+from synpick_warp.stages.render.raster import allocate_background, allocate_visibility
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import blank_scene
-from synpick_warp.stages.render.view_setup import allocate_background, allocate_placed, allocate_visibility
+from synpick_warp.stages.render.view_setup import allocate_placed
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
 from synpick_warp.stages.sim.simulate import allocate_worlds
 from synpick_warp.stages.sim.step_log import allocate_record, record_sizes

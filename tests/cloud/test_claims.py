@@ -13,7 +13,8 @@ import pytest
 
 import synpick_warp
 from synpick_warp.cloud import claims, run, workers
-from synpick_warp.cloud.claims import Chunk, Chunks, Claims, LeaseLostError, Ledger, Sizes, default_chunk
+from synpick_warp.cloud.claims import Chunk, Chunks, Claims, LeaseLostError, Sizes, default_chunk
+from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.run import Crew, Job, PlanProgress
 from synpick_warp.cloud.workers import bake_with_devices
 from synpick_warp.errors import StoreError, SynpickError

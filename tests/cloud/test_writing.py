@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from synpick_warp.cloud import run
-from synpick_warp.cloud.claims import FINISHED, Ledger
+from synpick_warp.cloud.ledger import FINISHED, Ledger
 from synpick_warp.configs.schema import FORMATS, Split
 from synpick_warp.dataset.commit.manifest import INPUTS, OBJECT, encode_manifest, make_manifest
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError

@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import pytest
 
-from synpick_warp.cloud import claims, run
-from synpick_warp.cloud.claims import CLAIMS, ENTRY, FINISHED, INDEX, Claims, LeaseLostError, Ledger
+from synpick_warp.cloud import ledger, run
+from synpick_warp.cloud.claims import CLAIMS, Claims, LeaseLostError
+from synpick_warp.cloud.ledger import ENTRY, FINISHED, INDEX, Ledger
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
@@ -61,11 +62,11 @@ def without_formats(patch: pytest.MonkeyPatch) -> None:
     decode = Ledger._decode
     patch.setattr(store, "describe_fault", str)
     patch.setattr(run, "finalize_store", _finalize)
-    patch.setattr(claims.manifests, "make_manifest", lambda config: MANIFEST)
-    patch.setattr(claims.DataLayout, "of", lambda config: LAYOUT)
+    patch.setattr(ledger.manifests, "make_manifest", lambda config: MANIFEST)
+    patch.setattr(ledger.DataLayout, "of", lambda config: LAYOUT)
     patch.setattr(Ledger, "_decode", lambda self, data: MANIFEST if data == MANIFEST_FILE else decode(self, data))
-    patch.setattr(claims, "config_to_toml", lambda config: SETTINGS)
-    patch.setattr(claims.manifests, "describe_differences", lambda ours, theirs: "" if ours == theirs else "all")
+    patch.setattr(ledger, "config_to_toml", lambda config: SETTINGS)
+    patch.setattr(ledger.manifests, "describe_differences", lambda ours, theirs: "" if ours == theirs else "all")
 
 
 def _finalize(log: Ledger, folder: Path) -> int:

@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterable
 import pytest
 
 from synpick_warp.cloud import claims, run
-from synpick_warp.cloud.claims import Claim, Ledger
+from synpick_warp.cloud.claims import Claim
+from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.system.stores import store
 from synpick_warp.system.stores.store import Store
 from tests.simulation.claiming import Schedule, without_formats

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from synpick_warp.cloud import run
-from synpick_warp.cloud.claims import Ledger
+from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit import manifest
 from synpick_warp.dataset.commit.manifest import read_entry

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
 from synpick_warp.apps.conversion.run import convert
-from synpick_warp.cloud.claims import ENTRY
+from synpick_warp.cloud.ledger import ENTRY
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config

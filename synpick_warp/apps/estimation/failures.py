@@ -16,8 +16,8 @@ from synpick_warp.apps.evaluation.truth import PoseTable, Truth
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.render.raster import object_scene, render_object
 from synpick_warp.stages.render.scene import build_meshes
-from synpick_warp.stages.render.view_setup import object_scene, render_object
 from synpick_warp.system.codecs.charts import INK, SOFT, printable
 
 Color = tuple[int, int, int]

@@ -17,8 +17,8 @@ from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.errors import CatalogError, ConfigError, DatasetError, SynpickError
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.types import Camera, TriangleMesh
+from synpick_warp.stages.render.raster import object_scene, render_object
 from synpick_warp.stages.render.scene import build_meshes
-from synpick_warp.stages.render.view_setup import object_scene, render_object
 from synpick_warp.system.hardware.device import pick_device, start_warp
 
 _MILLIMETRE = 1e-3

@@ -18,17 +18,9 @@ from synpick_warp.stages.arrays import allocate, allocate_struct, array_group, d
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.cameras import VIEW_CAMERAS
+from synpick_warp.stages.render.raster import Rasterizer, allocate_visibility
 from synpick_warp.stages.render.scene import RenderScene, build_grid, with_cameras
-from synpick_warp.stages.render.view_setup import (
-    GBUFFER,
-    VIEW_BODIES,
-    VIEWS,
-    PropPlacer,
-    Rasterizer,
-    allocate_visibility,
-    body_sizes,
-    set_up_views,
-)
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, PropPlacer, body_sizes, set_up_views
 
 _LENGTHS = dict.fromkeys(("area", "distance", "contour"), "px")
 _LISTS = {"largest": ("view", "instance"), "contour": ("view", "instance", "point"), "contour_length": ("view", "instance")}

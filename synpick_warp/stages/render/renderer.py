@@ -23,12 +23,12 @@ from synpick_warp.stages.render.denoised import DenoisedRenderer, ReferenceRende
 from synpick_warp.stages.render.layers import LayerRenderer, sensor_parameters
 from synpick_warp.stages.render.looks import Dresser
 from synpick_warp.stages.render.postprocess import PostProcessor, Shutter, has_effects
+from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import (
     GBUFFER,
     VIEW_BODIES,
     PropPlacer,
-    Rasterizer,
     bin_bodies,
     body_sizes,
     make_shot,

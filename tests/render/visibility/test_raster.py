@@ -16,7 +16,7 @@ from synpick_warp.configs.calibration.lens import FISHEYE, with_matrix
 from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import Camera, Fixture, TriangleMesh
-from synpick_warp.stages.render import view_setup
+from synpick_warp.stages.render import raster
 from synpick_warp.stages.render.cameras import allocate_lenses, allocate_view_cameras, place_cameras
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.environment import default_device
@@ -177,12 +177,12 @@ def test_the_order_of_triangles_and_bodies_does_not_matter(device):
     np.testing.assert_array_equal(first["triangle"][met], shuffled[second["triangle"][met]])
 
 
-@pytest.mark.parametrize("capacity", [0, 3, view_setup.BLOCKS])
+@pytest.mark.parametrize("capacity", [0, 3, raster.BLOCKS])
 def test_large_triangles_are_complete_with_any_capacity_for_blocks(device, capacity, monkeypatch):
     toy = one(box(0.3, 0.2, 0.1), (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927), camera(192, 128, 300.0, (0.0, 0.0, 1.0)))
     _, expected = gbuffers_of(toy, device)
-    monkeypatch.setattr(view_setup, "BLOCKS", capacity)
-    monkeypatch.setattr(view_setup, "INSTANCE_BLOCKS", 0)
+    monkeypatch.setattr(raster, "BLOCKS", capacity)
+    monkeypatch.setattr(raster, "INSTANCE_BLOCKS", 0)
     found = gbuffer_of(toy, device)
     np.testing.assert_array_equal(found["segment"], expected["segment"])
     np.testing.assert_array_equal(found["amodal"], (expected["segment"] == 1).astype(np.uint32))
@@ -257,7 +257,7 @@ def test_a_bin_that_moves_with_camera_and_objects_gives_the_same_picture(device)
 
 
 def test_a_mesh_with_more_triangles_than_marks_can_name_is_refused(device, monkeypatch):
-    monkeypatch.setattr(view_setup, "MAX_TRIANGLES", 11)
+    monkeypatch.setattr(raster, "MAX_TRIANGLES", 11)
     with pytest.raises(CatalogError, match="a mesh has 12 triangles; at most 11"):
         gbuffer_of(ToyScene([entry(box(0.1, 0.1, 0.1))], [[]], (VIEW,)), device)
 
