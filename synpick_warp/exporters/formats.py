@@ -3,9 +3,9 @@
 How to add a format:
 
 1. Write a class that implements `Exporter` (`base.py`). `EpisodeExporter` (there) stages and commits for it. A format of views is a
-   `SceneExporter` (`bop/scene_exporter.py`), which hands it encoded views, in a subpackage of `bop/`: follow `bop/yolo/`. A format of ticks
+   `SceneExporter` (`bop/scene_exporter.py`), which hands it encoded views, in a module of `bop/`: follow `bop/yolo.py`. A format of ticks
    is a subpackage beside it: follow `usd/exporter.py`. Views come in any order, from several processes: for one file a scene, append
-   records, and sort and count them in the commit task, as `bop/coco/` does. Name the subpackage in the import contract of its folder in
+   records, and sort and count them in the commit task, as `bop/coco.py` does. Name the module in the import contract of its folder in
    pyproject.toml.
 2. Add a row to FORMAT_TABLE, and its name to `FORMATS` in configs/schema.py: settings must not import exporters, and a test compares both.
    In a package of your own, name the row (a `Format`) as an entry point instead: see `system/plugins.py`.
