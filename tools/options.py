@@ -50,20 +50,15 @@ def existing_folder(text: str) -> Path:
     return path
 
 
-def number_in(low: float, high: float = math.inf) -> Callable[[str], float]:
-    """Argument type of an option: a finite number from low to high."""
-
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high or value == math.inf:
-            allowed = f"{low:g} to {high:g}" if math.isfinite(high) else f"finite numbers from {low:g} on"
-            raise argparse.ArgumentTypeError(f"{text} is out of range; allowed: {allowed}")
-        return value
-
-    return parse
+def finite_amount(text: str) -> float:
+    """Argument type of an option: a finite number from 0 on."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is out of range; allowed: finite numbers from 0 on")
+    return value
 
 
 def image_resolution(text: str) -> list[int | str]:

@@ -114,9 +114,9 @@ class Copier:
                 yield int(match[1])
 
 
-def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name: True, report: Report = ignore_progress) -> None:
-    """Download a whole data set into a new folder, which is made. `wanted`: whether a file is copied, by its name. Raises DatasetError: it
-    is no data set, or larger than FREE_PART of the free space there."""
+def copy_set(url: str, folder: Path, report: Report = ignore_progress) -> None:
+    """Download a whole data set into a new folder, which is made. Raises DatasetError: it is no data set, or larger than FREE_PART of the
+    free space there."""
     copier = Copier(url, folder)  # Refuses URLs whose last part would lead elsewhere.
     folder.mkdir()
     copier.fetch_records()
@@ -124,7 +124,7 @@ def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name
     size = 0
     free = int(FREE_PART * shutil.disk_usage(folder).free)
     for name, length in copier.store.list(""):
-        if name.startswith(f"{CONTROL}/") or not wanted(name):
+        if name.startswith(f"{CONTROL}/"):
             continue
         names[name] = None, MAX_JSON if name.startswith(f"{manifests.ENTRIES}/") else length
         size += length

@@ -96,7 +96,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--devices", default="", help=devices_help)
     instances_help = "numbers of like parts, of which the part growth measures physics alone: 10,32,64,128,251"
     parser.add_argument("--instances", type=command_line.counts, default=(), metavar="NUMBERS", help=instances_help)
-    parser.add_argument("--seconds", type=command_line.number_in(0.0), default=2.0, help="minimum time of a measurement [s] (default: 2)")
+    parser.add_argument("--seconds", type=command_line.finite_amount, default=2.0, help="minimum time of a measurement [s] (default: 2)")
     options = parser.parse_args(arguments)
     if options.parts is None:
         options.parts = () if options.compare else DEFAULT_PARTS

@@ -5,6 +5,9 @@ collision shapes, rigid bodies, semantic labels.
 Stages are in metres, z up, as everywhere in this package. Imports pxr, so only modules that write USD import it.
 """
 
+# pxr's modules are filled when they are loaded, invisible to type checkers.
+# pyright: reportAttributeAccessIssue=false
+
 import errno
 import os
 import re

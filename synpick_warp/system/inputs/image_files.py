@@ -42,13 +42,10 @@ def image_size(data: bytes) -> tuple[int, int] | None:
         return None
 
 
-def decode_image(
-    data: bytes, source: object, error: type[SynpickError], flags: int = -1, size: tuple[int, int] | None = None
-) -> np.ndarray:
-    """Decode a PNG or JPEG file's content by OpenCV; unchanged greyscale PNG files as a bake writes them by ISA-L, which is faster.
-    `source`: where it comes from, for messages. `flags`: OpenCV's `IMREAD_` flags; -1: unchanged. `size`: width and height that it must
-    have [px]; None: any up to MAX_SIDE. Returns the image (H, W[, 3]), blue first. Raises SynpickError: as `error`, in one line: it is not
-    an image of that size."""
+def decode_image(data: bytes, source: object, error: type[SynpickError], size: tuple[int, int] | None = None) -> np.ndarray:
+    """Decode a PNG or JPEG file's content by OpenCV, unchanged; greyscale PNG files as a bake writes them by ISA-L, which is faster.
+    `source`: where it comes from, for messages. `size`: width and height that it must have [px]; None: any up to MAX_SIDE. Returns the
+    image (H, W[, 3]), blue first. Raises SynpickError: as `error`, in one line: it is not an image of that size."""
     stated = None if data.startswith(_TIFF) else image_size(data)
     if stated is None:
         raise error(f"{source} is not an image: neither PNG nor JPEG")
@@ -56,35 +53,27 @@ def decode_image(
         raise error(f"{source} has {_show(stated)} pixels; the images of this camera have {_show(size)}")
     if not (min(stated) > 0 and max(stated) <= MAX_SIDE):
         raise error(f"{source} has {_show(stated)} pixels; allowed: up to {MAX_SIDE} x {MAX_SIDE}")
-    import cv2
-    import numpy as np
-
-    if flags == cv2.IMREAD_UNCHANGED and data.startswith(_PNG) and (fast := _decode_grey(data, stated)) is not None:
-        return fast
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        image = None
-    # Metadata may ask for a rotation.
-    if image is None or sorted(image.shape[:2]) != sorted(stated):
-        raise error(f"{source} is not an image that OpenCV can decode")
-    if size is not None and image.shape[1::-1] != size:
-        raise error(f"{source} has {_show(image.shape[1::-1])} pixels; the images of this camera have {_show(size)}")
-    return image
+    fast = _decode_grey(data, stated) if data.startswith(_PNG) else None
+    return _decode_by_opencv(data, source, error, stated) if fast is None else fast
 
 
 def decode_picture(data: bytes, source: object, error: type[SynpickError], size: tuple[int, int] | None = None) -> np.ndarray:
     """Decode a PNG, JPEG or TIFF file, keeping its channels and bit depth. Arguments, result and errors are those of `decode_image`."""
     if not data.startswith(_TIFF):
         return decode_image(data, source, error, size=size)
-    import cv2
-    import numpy as np
-
     stated = image_size(data)
     if stated is None or not (min(stated) > 0 and max(stated) <= MAX_SIDE):
         raise error(f"{source} is not a TIFF image of up to {MAX_SIDE} x {MAX_SIDE} pixels")
     if size is not None and stated != size:
         raise error(f"{source} has {_show(stated)} pixels; the images of this camera have {_show(size)}")
+    return _decode_by_opencv(data, source, error, stated)
+
+
+def _decode_by_opencv(data: bytes, source: object, error: type[SynpickError], stated: tuple[int, int]) -> np.ndarray:
+    """Image of a file, unchanged; raises `error` unless it has the size that its header states, as after a TIFF's rotation."""
+    import cv2
+    import numpy as np
+
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

@@ -19,7 +19,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import recv_handle, send_handle
 from typing import Any, Self
 
 from synpick_warp.errors import SynpickError
@@ -230,7 +229,7 @@ class WorkerPool:
             except Exception as error:
                 future.set(None, error)
             return future
-        message = pickle.dumps((task, False))
+        message = pickle.dumps(task)
         if drain:
             self.receive(0.0)
         worker = min(self._workers, key=_load)
@@ -240,17 +239,16 @@ class WorkerPool:
         self._send(worker, message)
         return future
 
-    def broadcast(self, task: Callable[..., Any], handle: int | None = None) -> list[TaskFuture]:
-        """Send a task to every process; returns their futures. `handle`: open file that the task receives besides the state, as a handle of
-        its own process, which the task closes. Raises DeadProcessError: a process died."""
+    def broadcast(self, task: Callable[[Any], Any]) -> list[TaskFuture]:
+        """Send a task to every process; returns their futures. Raises DeadProcessError: a process died."""
         if self._runs_here:
             return [self.submit(task)]
-        message = pickle.dumps((task, handle is not None))
+        message = pickle.dumps(task)
         futures = []
         for worker in self._workers:
             futures.append(TaskFuture())
             worker.tasks.append(futures[-1])
-            self._send(worker, message, handle)
+            self._send(worker, message)
         return futures
 
     def receive(self, timeout: float | None) -> list[TaskFuture]:
@@ -306,12 +304,10 @@ class WorkerPool:
         self._links.close()
         self._state = None
 
-    def _send(self, worker: WorkerProcess, message: bytes, handle: int | None = None) -> None:
-        """Send a message to a worker, and a file handle; raises DeadProcessError if it has ended."""
+    def _send(self, worker: WorkerProcess, message: bytes) -> None:
+        """Send a message to a worker; raises DeadProcessError if it has ended."""
         try:
             worker.link.send_bytes(message)
-            if handle is not None:
-                send_handle(worker.link, handle, None)
         except OSError as error:
             raise DeadProcessError(self._program, worker) from error
 
@@ -357,10 +353,8 @@ def main() -> None:
     link = Connection(int(sys.argv[1]))
     try:
         state, fault = _run(link.recv())
-        while (message := link.recv()) is not None:
-            task, has_handle = message
-            handles = (recv_handle(link),) if has_handle else ()
-            link.send((None, fault) if fault else _run(task, state, *handles))
+        while (task := link.recv()) is not None:
+            link.send((None, fault) if fault else _run(task, state))
     except (EOFError, ConnectionError):
         return  # The parent has ended; nobody is left to receive an answer.
 

@@ -36,7 +36,7 @@ from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.online.dataset import StreamDataset
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run, write_run
-from tools.options import MeasuredRow, configure, existing_folder, fail, make_parser, number_in, positive_count, print_rows
+from tools.options import MeasuredRow, configure, existing_folder, fail, finite_amount, make_parser, positive_count, print_rows
 from tools.reports.real.frames import RealFrame, read_frames, render_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
@@ -69,8 +69,8 @@ COUNTS = {
 """Options that are integers above 0: default and meaning."""
 OWN = {
     **{name: {"type": positive_count, "default": value, "help": f"{text} (default: {value})"} for name, (value, text) in COUNTS.items()},
-    "passes": {"type": number_in(0.0), "default": 40.0, "help": "number of epochs, if time allows (default: 40)"},
-    "seconds": {"type": number_in(0.0), "default": 280.0, "help": "time limit of a training with its stream [s] (default: 280)"},
+    "passes": {"type": finite_amount, "default": 40.0, "help": "number of epochs, if time allows (default: 40)"},
+    "seconds": {"type": finite_amount, "default": 280.0, "help": "time limit of a training with its stream [s] (default: 280)"},
     "pictures": {"type": existing_folder, "metavar": "DIR", "help": "write overlays of all frames to this folder"},
 }
 """Options of this report; see `tools.options.OPTIONS`."""
