@@ -63,26 +63,26 @@ class FusedSteel(newton.solvers.SolverSteel):
                 sort_by_worlds(self._friction_patches, self.model)
                 self._friction_patches.build = partial(self._build_patches, self._friction_patches.build)
 
-    def _stage1_joint_tau(self, *args: Any) -> None:
+    def _stage1_joint_tau(self, *args: Any, **options: Any) -> None:
         """Compute joint torques, the first of the terms that friction patches do not need; arguments as in SolverSteel."""
         self._kinematics_ready = self._record()
-        super()._stage1_joint_tau(*args)
+        super()._stage1_joint_tau(*args, **options)
 
     def _build_patches(self, build: Callable[..., None], *args: Any, **options: Any) -> None:
         """Build the friction patches beside the terms without contacts; arguments of `build` as in Newton."""
         with self._branch(self._kinematics_ready):
             build(*args, **options)
 
-    def _mf_pgs_setup(self, *args: Any) -> None:
+    def _mf_pgs_setup(self, *args: Any, **options: Any) -> None:
         """Compute the free bodies' inverse inertias and rows, the last that responses to impulses need; arguments as in SolverSteel."""
-        super()._mf_pgs_setup(*args)
+        super()._mf_pgs_setup(*args, **options)
         self._inertias_ready = self._record()
 
-    def _propagation_setup(self, *args: Any) -> None:
+    def _propagation_setup(self, *args: Any, **options: Any) -> None:
         """Compute responses to contact impulses beside the warm start of the other rows; arguments as in SolverSteel."""
         self._velocities_ready = self._record()
         with self._branch(self._inertias_ready):
-            super()._propagation_setup(*args)
+            super()._propagation_setup(*args, **options)
 
     def _propagation_refresh_twists(self, *, force: bool) -> None:
         """Compute the twists of bodies from joint velocities; arguments as in SolverSteel."""
