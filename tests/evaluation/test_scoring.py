@@ -283,7 +283,7 @@ def test_matching_is_the_toolkits(keys, others, data):
     assert all(pairs.truth[index] == row for row, index in enumerate(found) if index >= 0)
 
 
-# ---- errors: agreement with the BOP toolkit's functions, invariance under symmetries ----
+# ---- errors: hand-computed values, agreement with the BOP toolkit's functions, invariance under symmetries ----
 
 
 AXIS = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
@@ -298,10 +298,20 @@ def random_pairs(seed: int, count: int, spread: float = 0.1) -> tuple[np.ndarray
     return estimated.as_matrix(), place + random.normal(0.0, spread, (count, 3)), true.as_matrix(), place
 
 
-def test_add_s_searches_from_the_true_to_the_estimated_pose():
+def test_hand_computed_errors():
+    vertices = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    quarter = Rotation.from_euler("z", [[90]], degrees=True).as_matrix()
+    one, zero = np.eye(3)[None], np.zeros((1, 3))
+    # Quarter turn: one vertex stays, the other moves by √2; its nearest vertex in the estimated pose is the origin.
+    assert add_errors(quarter, zero, one, zero, vertices) == pytest.approx([np.sqrt(2.0) / 2.0])
+    assert adds_errors(quarter, zero, one, zero, vertices) == pytest.approx([0.5])
+    assert add_errors(one, np.array([[3.0, 4.0, 0.0]]), one, zero, vertices) == pytest.approx([5.0])
+    assert adds_errors(one, np.array([[1.0, 0.0, 0.0]]), one, zero, vertices) == pytest.approx([0.5])
+    assert translation_errors(np.array([[3.0, 4.0, 0.0]]), zero) == pytest.approx([5.0])
+    assert rotation_errors(quarter, one) == pytest.approx([90.0])
+    # ADD-S searches from the true to the estimated pose.
     vertices = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [5.0, 0.0, 0.0]])
-    turn = Rotation.from_euler("y", [[90]], degrees=True).as_matrix()
-    pair = turn, np.array([[0.0, 0.0, 1.0]]), np.eye(3)[None], np.zeros((1, 3))
+    pair = Rotation.from_euler("y", [[90]], degrees=True).as_matrix(), np.array([[0.0, 0.0, 1.0]]), one, zero
     forward, backward = adds_errors(*pair, vertices), adds_errors(*pair[2:], *pair[:2], vertices)
     assert abs(forward - backward) > 0.01
     assert forward == pytest.approx([twin.adi(*(part[0] for part in pair), vertices)])

@@ -266,6 +266,15 @@ def test_impulses_are_those_of_a_bisection(device, condition):
     assert error.max() < 5e-5
 
 
+def test_an_impulse_in_equilibrium_stays(device):
+    """Solved again with the residual of its own solution, an impulse changes by the tolerance at most."""
+    matrices, residual, old, radius = random_contacts(2000, 20.0, seed=2)
+    first = solve(matrices, residual, old, radius, device).astype(float)
+    after = residual + np.einsum("nij,nj->ni", matrices, first - old)
+    second = solve(matrices, after, first, radius, device)
+    assert (np.linalg.norm(second - first, axis=1) / radius).max() < 2e-5
+
+
 def test_without_load_there_is_no_friction(device):
     matrices, residual, old, _ = random_contacts(50, 5.0)
     assert (solve(matrices, residual, old, np.zeros(50), device) == 0.0).all()

@@ -229,20 +229,36 @@ TAIL = [(1, np.s_[4:25, 4:25]), (1, np.s_[12:17, 25:63])]
 @pytest.mark.parametrize(
     ("parts", "mass", "expected"),
     [
-        pytest.param([(1, np.s_[10:31, 20:41])], 0.1, [30, 20], id="a square at its centre"),
-        pytest.param([(1, np.s_[10:21, 5:46])], 0.1, [25, 15], id="a bar, which has a row of poles, at its centroid"),
         pytest.param(
-            [(1, np.s_[4:44, 4:13]), (1, np.s_[39:44, 4:60])], 0.1, [8, 8], id="an L at its pole: its centroid and the midpoint lie outside"
+            [(1, np.s_[10:31, 20:41])],
+            0.1,
+            {"pole": [30, 20], "centroid": [30, 20], "midpoint": [30, 20], "distances": [11, 11, 11], "grasp_pixel": [30, 20]},
+            id="a square at its centre",
         ),
-        pytest.param(TAIL, 0.1, [14, 14], id="a light tail at its pole"),
-        pytest.param(TAIL, 0.8, [14, 14], id="a tail at the limit of mass"),
-        pytest.param(TAIL, 0.9, [18, 14], id="a heavy tail at the midpoint"),
+        pytest.param(
+            [(1, np.s_[10:21, 5:46])],
+            0.1,
+            {"pole": [10, 15], "centroid": [25, 15], "distances": [6, 6, 6], "grasp_pixel": [25, 15]},
+            id="of a bar's row of poles the first is kept, and the centroid is preferred",
+        ),
+        pytest.param(
+            [(1, np.s_[4:44, 4:13]), (1, np.s_[39:44, 4:60])],
+            0.1,
+            {"pole": [8, 8], "distances": [5, 0, 0], "grasp_pixel": [8, 8]},
+            id="an L at its pole, as its centroid and the midpoint lie outside",
+        ),
+        pytest.param(TAIL, 0.1, {"pole": [14, 14], "grasp_pixel": [14, 14]}, id="a light tail at its pole"),
+        pytest.param(TAIL, 0.8, {"pole": [14, 14], "grasp_pixel": [14, 14]}, id="a tail at the limit of mass"),
+        pytest.param(TAIL, 0.9, {"pole": [14, 14], "grasp_pixel": [18, 14]}, id="a heavy tail at the midpoint"),
+        pytest.param(
+            [(1, np.s_[4:45, 10:51]), (0, np.s_[22:27, 28:33])], 0.1, {"centroid": [30, 24]}, id="a hole moves the pole off the centroid"
+        ),
     ],
 )
 def test_known_grasp_points(harness, parts, mass, expected):
     harness.mass[0] = mass
     check(harness, draw(*parts))
-    assert harness.result("grasp_pixel").tolist() == expected
+    assert {name: harness.result(name).tolist() for name in expected} == expected
 
 
 # ---- images ----

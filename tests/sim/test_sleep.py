@@ -214,16 +214,21 @@ def joined(device, bodies: int, pairs: list[tuple[int, int]]) -> list[int]:
     return roots.tolist()
 
 
-def test_islands_are_those_of_union_find(device):
-    """Shape -1 is the ground's, which joins nothing."""
+@pytest.mark.parametrize("flipped", [False, True])
+def test_islands_are_the_components_of_the_contact_graph(device, flipped):
+    pairs = [(5, 6), (4, 5), (0, -1), (2, 1), (6, 3), (-1, 7)]
+    pairs = [(b, a) for a, b in reversed(pairs)] if flipped else pairs
+    assert joined(device, 8, pairs) == [0, 1, 1, 3, 3, 3, 3, 7]
+
+
+def test_random_islands_are_those_of_union_find(device):
     rng = np.random.default_rng(3)
     for count in (20, 60, 200):
-        pairs = [tuple(map(int, pair)) for pair in rng.integers(-1, 100, (count, 2))]
+        pairs = [tuple(map(int, pair)) for pair in rng.integers(0, 100, (count, 2))]
         expected = np.arange(100)
         for _ in range(100):
             for a, b in pairs:
-                if min(a, b) >= 0:
-                    expected[[a, b]] = expected[[a, b]].min()
+                expected[[a, b]] = expected[[a, b]].min()
         assert joined(device, 100, pairs) == expected.tolist()
 
 

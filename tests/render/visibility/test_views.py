@@ -1,4 +1,4 @@
-"""Views: pixel tiles, projected boxes, bodies of tiles in their order, and kernels by the structs of their arguments."""
+"""Views: pixel tiles, camera rays, projected boxes, bodies of tiles in their order, and kernels by the structs of their arguments."""
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from synpick_warp.kernels.render.visibility.camera import (
     Views,
     in_image,
     lens_of,
+    pinhole_ray,
     projected_box,
     tile_pixel,
 )
@@ -38,7 +39,7 @@ def visit_pixel(grid: ImageGrid, visits: wp.array3d[int], index: int):
         wp.atomic_add(visits, view, row, column, 1)
 
 
-visit, box_of = probe(visit_pixel), probe(projected_box, cameras=CameraTable)
+visit, ray_of, box_of = probe(visit_pixel), probe(pinhole_ray), probe(projected_box, cameras=CameraTable)
 
 
 def project(lower, upper, rotation, position):
@@ -53,6 +54,15 @@ def test_tiles_visit_every_pixel_once(width, height):
     visits = wp.zeros((2, height, width), dtype=int, device=default_device())
     visit(grid, visits, np.arange(2 * grid.tiles * 32))
     assert (visits.numpy() == 1).all()
+
+
+def test_rays_pass_pixel_centres():
+    rays = ray_of((10.0, 20.0, 1.5, 1.0), *np.indices((2, 3)), (0.0, 0.0))
+    np.testing.assert_allclose(rays[0, 0], [-1.0 / 10.0, -0.5 / 20.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(rays[1, 2], [1.0 / 10.0, 0.5 / 20.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(rays[0, 1][0], 0.0, atol=1e-7)
+    rays = ray_of((10.0, 20.0, 1.5, 1.0), *np.indices((2, 3)), (0.5, -0.5))
+    np.testing.assert_allclose(rays[0, 0], [-0.5 / 10.0, -1.0 / 20.0, 1.0], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
