@@ -290,6 +290,19 @@ def test_an_old_impulse_may_be_far_outside_the_disk(device):
     assert (np.linalg.norm(found - expected, axis=1) / radius).max() < 1e-3
 
 
+def test_sliding_impulses_satisfy_the_optimality_conditions(device):
+    """A x - b = -α x with α >= 0, as Karush, Kuhn and Tucker say."""
+    matrices, residual, old, radius = random_contacts(2000, 20.0, seed=4)
+    found = solve(matrices, residual, old, radius, device).astype(float)
+    slides = np.linalg.norm(found, axis=1) > 0.99999 * radius
+    velocity = (residual + np.einsum("nij,nj->ni", matrices, found - old))[slides]
+    x = found[slides] / radius[slides, None]
+    size = np.linalg.norm(residual, axis=1) + np.linalg.norm(matrices, axis=(1, 2)) * radius
+    across = velocity[:, 0] * x[:, 1] - velocity[:, 1] * x[:, 0]
+    assert (np.abs(across) / size[slides]).max() < 1e-4
+    assert ((velocity * x).sum(1) / size[slides]).max() < 1e-5
+
+
 def test_over_relaxation_is_clipped_to_the_disk(device):
     contacts = random_contacts(2000, 5.0, seed=5)
     exact, relaxed = solve(*contacts, device).astype(float), solve(*contacts, device, 1.5)
@@ -298,20 +311,27 @@ def test_over_relaxation_is_clipped_to_the_disk(device):
     assert (np.linalg.norm(relaxed - expected, axis=1) / contacts[3]).max() < 1e-4
 
 
+STICKS = (np.diag((2.0, 4.0)), (0.02, 0.04), (0.001, 0.002), 1.0)
+SLIDES = (3.0 * np.eye(2), (0.6, -0.8), (0.0, 0.0), 0.01)
 ONE_ROW, NONE = np.diag((1.0, 0.0)), np.zeros((2, 2))
 
 
 @pytest.mark.parametrize(
-    ("contact", "expected", "tolerance"),
+    ("contact", "relaxation", "expected", "tolerance"),
     [
-        ((ONE_ROW, (0.0, 0.0), (0.5, 0.25), 1.0), (0.5, 0.25), 1e-6),
-        ((ONE_ROW, (0.0, 0.0), (0.5, 2.0), 1.0), (0.5, np.sqrt(0.75)), 1e-5),
-        ((NONE, (0.3, 0.4), (0.1, 0.1), 1.0), (0.0, 0.0), 0.0),
+        (STICKS, 1.0, (0.001 - 0.01, 0.002 - 0.01), 1e-6),
+        (STICKS, 0.5, (0.001 - 0.005, 0.002 - 0.005), 1e-6),
+        (SLIDES, 1.0, (-0.006, 0.008), 1e-5),
+        ((ONE_ROW, (0.0, 0.0), (0.5, 0.25), 1.0), 1.0, (0.5, 0.25), 1e-6),
+        ((ONE_ROW, (0.0, 0.0), (0.5, 2.0), 1.0), 1.0, (0.5, np.sqrt(0.75)), 1e-5),
+        ((NONE, (0.3, 0.4), (0.1, 0.1), 1.0), 1.0, (0.0, 0.0), 0.0),
     ],
-    ids=["within the disk", "beyond the disk", "no body moves"],
+    ids=["sticks", "half", "slides", "no response", "no response beyond the disk", "no body moves"],
 )
-def test_a_row_without_response_keeps_its_impulse_within_the_disk(device, contact, expected, tolerance):
-    np.testing.assert_allclose(solve(*(np.array([part]) for part in contact), device), [expected], rtol=tolerance)
+def test_known_impulses(device, contact, relaxation, expected, tolerance):
+    """Analytic: a contact that sticks has no velocity left; with equal eigenvalues the impulse opposes the residual; a row without
+    response keeps its impulse within the disk."""
+    np.testing.assert_allclose(solve(*(np.array([part]) for part in contact), device, relaxation), [expected], rtol=tolerance)
 
 
 def test_a_residual_without_response_pushes_to_the_edge_of_the_disk(device):

@@ -197,13 +197,45 @@ def test_a_batch_without_worlds_writes_nothing(device):
 # ---- contours and distances ----
 
 
+def test_the_contour_and_the_distances_of_a_rectangle(harness):
+    check(harness, draw((1, np.s_[4:7, 10:15])))
+    around = [(10, 4), (10, 5), (10, 6), (11, 6), (12, 6), (13, 6), (14, 6), (14, 5), (14, 4), (13, 4), (12, 4), (11, 4)]
+    assert [tuple(point) for point in harness.contour()] == around
+    assert harness.result("centroid").tolist() == [12.0, 5.0]
+    assert (harness.image("distance")[4:7, 10:15] == [[1, 1, 1, 1, 1], [1, 2, 2, 2, 1], [1, 1, 1, 1, 1]]).all()
+
+
 @pytest.mark.parametrize("steps", [np.arange(5), np.arange(1)], ids=["line", "pixel"])
 @pytest.mark.parametrize(("row", "column"), [(0, 1), (1, 0), (1, 1), (1, -1)])
 def test_a_line_is_traversed_in_both_directions(harness, steps, row, column):
-    """The ends count once and all other points twice; the mean is still the centre."""
     check(harness, draw((1, (8 + row * steps, 20 + column * steps))))
-    last = len(steps) - 1
+    points, last = harness.contour(), len(steps) - 1
+    assert len(points) == max(1, 2 * last)
+    assert (points[: last + 1] == np.stack([20 + column * steps, 8 + row * steps], axis=1)).all()
+    # The ends count once and all other points twice; the mean is still the centre.
     assert harness.result("centroid").tolist() == [20.0 + column * last / 2, 8.0 + row * last / 2]
+    assert harness.image("distance").max() == 1.0
+
+
+def test_a_hole_changes_the_distance_and_not_the_centroid(harness):
+    whole, hole = (1, np.s_[5:26, 10:31]), (0, np.s_[13:16, 16:19])
+    for parts, expected in (((whole,), 6.0), ((whole, hole), 1.0)):
+        check(harness, draw(*parts))
+        assert harness.result("centroid").tolist() == [20.0, 15.0]
+        assert len(harness.contour()) == 80
+        assert harness.image("distance")[15, 15] == expected
+    assert harness.image("distance")[14, 17] == 0.0
+    assert harness.image("distance")[17, 15] == pytest.approx(np.sqrt(5.0), rel=1e-6)
+
+
+def test_pixels_beyond_the_border_and_of_touching_instances_are_outside(harness):
+    check(harness, draw((2, np.s_[:])))
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    assert (harness.image("distance") == np.minimum.reduce([rows + 1, HEIGHT - rows, columns + 1, WIDTH - columns])).all()
+    assert len(harness.contour(1)) == 2 * (WIDTH + HEIGHT) - 4
+    check(harness, draw((1, np.s_[6:20, :20]), (2, np.s_[6:20, 20:])))
+    assert harness.image("distance")[12, 17:22].tolist() == [3.0, 2.0, 1.0, 1.0, 2.0]
+    assert [harness.contour(0)[:, 0].max(), harness.contour(1)[:, 0].min()] == [19, 20]
 
 
 def test_a_contour_beyond_the_capacity_is_truncated_and_flagged(device):
@@ -259,6 +291,15 @@ def test_known_grasp_points(harness, parts, mass, expected):
     harness.mass[0] = mass
     check(harness, draw(*parts))
     assert {name: harness.result(name).tolist() for name in expected} == expected
+
+
+def test_visible_fraction_of_a_sheet_is_its_area_over_the_expected_area(harness):
+    """Half of the expected area is visible, at a distance of 1.5 m."""
+    fx, fy = harness.focal
+    harness.area[0] = 2.0 * (30 * 1.5 / fx) * (20 * 1.5 / fy)
+    harness.observe(draw((1, np.s_[8:28, 10:40])), depth=1.5)
+    assert harness.result("visible_fraction") == pytest.approx(0.5, rel=1e-5)
+    assert harness.result("depth") == 1.5
 
 
 # ---- images ----

@@ -147,6 +147,44 @@ def test_contrast_and_saturation_change_srgb_values():
         np.testing.assert_allclose(postprocess(image, made)[0][0], 255.0 * np.clip(expected, 0.0, 1.0), atol=0.51)
 
 
+def blob(row: float, column: float) -> np.ndarray:
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return uniform_image(0.9 * np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / 8.0)[..., None])
+
+
+def centroid(values: np.ndarray) -> np.ndarray:
+    """Centre of mass: row and column."""
+    return np.array([(values * grid).sum() / values.sum() for grid in np.mgrid[: values.shape[0], : values.shape[1]]])
+
+
+def test_chromatic_aberration_magnifies_red_and_shrinks_blue():
+    image = blob(7.0, 9.0)
+    plain, _ = postprocess(image, make_config())
+    color, _ = postprocess(image, make_config(chromatic_aberration=(2.0, 2.0)))
+    np.testing.assert_array_equal(color[..., 1], plain[..., 1])
+    at = centroid(linear(plain)[0, ..., 1])
+    # From the middle of the image, pixel (19.5, 35.5), in proportion to the distance, 2 px in the corner.
+    outward = (at - (19.5, 35.5)) / np.hypot(20.0, 36.0) * 2.0
+    assert np.abs(outward).min() > 0.5
+    for channel, sign in ((0, 1.0), (2, -1.0)):
+        np.testing.assert_allclose(centroid(linear(color)[0, ..., channel]) - at, sign * outward, atol=0.05)
+
+
+def test_blur_is_a_normalized_gaussian_of_its_sigma():
+    point = uniform_image(0.0)
+    point[20, 36] = 20.0
+    color, effects = postprocess(point, make_config(blur=(1.5, 2.5)))
+    values = linear(color)[0, ..., 1]
+    sigma = float(parameter(effects, "blur")[0])
+    assert 1.5 < sigma < 2.5
+    np.testing.assert_allclose(values.sum(), 20.0, rtol=0.02)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    for grid, middle in ((rows, 20), (columns, 36)):
+        # The Gaussian ends at three sigma, which takes 3 % of its variance.
+        np.testing.assert_allclose((values * (grid - middle) ** 2).sum() / values.sum(), 0.973 * sigma**2, rtol=0.04)
+    assert (postprocess(uniform_image(0.4), make_config(blur=(3.0, 3.0)))[0] == postprocess(uniform_image(0.4), make_config())[0]).all()
+
+
 @pytest.mark.parametrize(
     ("shot", "read", "value"), [*((0.03, 0.008, value) for value in (0.08, 0.3, 0.8)), (0.0, 0.02, 0.2), (0.0, 0.02, 0.7)]
 )
