@@ -386,11 +386,11 @@ def test_another_data_set_in_the_same_folder_has_settings_of_its_own(tmp_path):
 def test_a_process_that_dies_is_one_line(out, monkeypatch, capfd, moment):
     tell = pool.WorkerPool._send
 
-    def tell_and_kill(self, worker, message, handle=None):
+    def tell_and_kill(self, worker, message):
         if (not worker.tasks) == (moment == "before the data set"):
             os.kill(worker.process.pid, signal.SIGKILL)
             worker.process.wait()
-        tell(self, worker, message, handle)
+        tell(self, worker, message)
 
     monkeypatch.setattr(pool.WorkerPool, "_send", tell_and_kill)
     with pytest.raises(ProcessError, match="a process that verifies was ended by SIGKILL; if memory ran out, set --threads"):

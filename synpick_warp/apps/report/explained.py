@@ -15,7 +15,6 @@ from synpick_warp.apps.viz.explain import draw_observation, planning_camera
 from synpick_warp.apps.viz.picks import draw_pick_maps
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.cell.gripper import Suction
-from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
@@ -58,8 +57,7 @@ def make_attempt(data_set: DataSet, found: Found, names: Mapping[int, str], albu
     """JSON of an attempt, whose picture is added to the album; None: it exceeds the budget, or there is no colour image. Raises
     DatasetError if the record or a file is missing or damaged."""
     config, episode = data_set.config, data_set[found.episode]
-    source = f"{data_set.folder / episode_entry(found.episode)}.json"
-    attempt = check_content(episode.attempts[found.place], explain_record.SeenAttempt, source)
+    attempt = explain_record.parse_attempt(episode.attempts[found.place], f"{data_set.folder / episode_entry(found.episode)}.json")
     if not attempt.frame < len(episode):
         raise DatasetError(f"attempt {attempt.attempt} of episode {found.episode} begins in frame {attempt.frame}; it has {len(episode)}")
     camera = config.rig.index(config.perception.camera)

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import cv2
 import networkx as nx
@@ -18,7 +19,7 @@ from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, blank, instan
 from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.configs.episodes.manipulation import ANOTHER, Pick, Target
 from synpick_warp.dataset import annotations
-from synpick_warp.dataset.annotations import ADVICE, InstanceObservation
+from synpick_warp.dataset.annotations import ADVICE, InstanceObservation, check_content
 from synpick_warp.dataset.commit.manifest import ATTEMPTS_FILE
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import MAX_JSON, decode_json, read_file
@@ -119,6 +120,11 @@ def _read_lines(dataset: Path) -> tuple[Path, list[bytes]]:
             f"{dataset} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target, mixed or cycle"
         )
     return path, read_file(path, MAX_JSON, DatasetError).splitlines()
+
+
+def parse_attempt(content: Mapping[str, Any], source: str) -> SeenAttempt:
+    """Parse a record of `synpick_warp.dataset.reading.Episode.attempts`; raises DatasetError if it is damaged."""
+    return check_content(content, SeenAttempt, source)
 
 
 def _line(path: Path, row: int) -> str:
