@@ -78,10 +78,14 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item])
     """Parallel map with a thread pool, one thread per usable core. Results are in the order of the items.
 
     Use it for functions that spend their time in NumPy, OpenCV or image decoders, which release the interpreter lock. Functions must not
-    launch kernels. If calls fail, the error of the first failed item is raised, and pending items are cancelled.
+    launch kernels. If calls fail, the error of the first failed item is raised, and pending items are cancelled. A single item needs no
+    thread, which takes some milliseconds.
     """
+    given = list(items)
+    if len(given) < 2:
+        return [function(item) for item in given]
     with ThreadPoolExecutor(count_cores(), thread_name_prefix=SETUP) as pool:
-        return list(pool.map(function, items))
+        return list(pool.map(function, given))
 
 
 def is_only_launcher() -> bool:
