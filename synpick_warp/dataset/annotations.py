@@ -308,7 +308,8 @@ class AttemptKey(msgspec.Struct):
 
 
 class Attempt(AttemptKey, omit_defaults=True):
-    """A line of attempts.jsonl: frames, outcome, target and grasp in the world (None: nothing was visible), rays, seals, perception."""
+    """Record of a pick attempt, one line of attempts.jsonl: frames, outcome, target, grasp in the world frame (None: nothing was visible),
+    suction rays, seals and perception."""
 
     mode: Literal["pick", "target"]
     frame: Index
@@ -332,8 +333,8 @@ class Attempt(AttemptKey, omit_defaults=True):
     hits: Index
     """Rays that hit an object when suction was switched on."""
     good_seal: bool
-    """True if at most `suction.tolerated_misses` rays of each cup missed, so that seals had the break force of a good seal; with
-    `suction.vacuum`, if leaks left at least half of it below each cup."""
+    """Whether the seals were good, with the break force of a good seal: at most `suction.tolerated_misses` rays of each cup missed. With
+    `suction.vacuum`: leaks left each cup at least half of the vacuum."""
     engaged: Instances
     """Instances that rays hit."""
     picked: Instances

@@ -16,8 +16,8 @@ from synpick_warp.newton_patches.narrow_phase import small_blocks
 BLOCK = 256
 """Threads that sort the contacts of a world."""
 FEW_WORLDS, GROWTH_BLOCK = 64, 4
-"""Number of worlds up to which the patches are grown in blocks of so many threads. The contacts of a pair of bodies are the work of one
-thread, for which the other threads of its warp wait."""
+"""Up to FEW_WORLDS worlds, patches are built with GROWTH_BLOCK threads per block: one thread processes the contacts of a pair of bodies,
+and the others of its warp wait for it. With 8 worlds this takes 58 us instead of 88; with 512 it is slower (H200)."""
 
 
 def sort_by_worlds(patches: Any, model: newton.Model) -> None:

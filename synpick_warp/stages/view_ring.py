@@ -1,7 +1,7 @@
 """Ring of batches of views of one image size: renders and encodes views, and copies them to the host asynchronously; which images are
 copied, and which are replaced by encoded files or run boundaries.
 
-Run boundaries are the positions at which masks change down a column, from which run lengths (RLE) are made; see `annotate`.
+Run boundaries are the pixels at which a mask changes along a column; its run-length encoding (RLE) follows from them; see `annotate`.
 
 Memory pool of amodal masks: views are split into batches whose masks fit, by upper bounds computed on the host from the poses. A view's
 share of the pool is that of some dozens of masks as large as the image; 150 parts in a bin take a fifteenth of it. Views that might take
@@ -39,8 +39,8 @@ from synpick_warp.views.frames import WORD_BYTES, most_words
 
 # Smallest image height at which the lists of run boundaries, at full length, are no larger than the images that they replace [px].
 MIN_LISTED_ROWS = 288
-# Pause between two queries of a copy's event: seconds, or a fraction of the wait so far, if that is longer. On an H200 a batch of 50
-# full-HD views takes 80 ms, and the next one is queued meanwhile.
+# Polling interval of a copy's event: seconds, or a fraction of the time waited so far, whichever is longer. A batch of 50 full-HD views
+# takes 80 ms on an H200, and the next batch is already queued.
 PAUSE_SECONDS, PAUSE_FRACTION = 5e-4, 1 / 32
 # Longest wait with pauses [s]. A query does not tell a failed copy from an unfinished one, and Warp prints a line for each that fails;
 # the synchronisation that comes next raises the error.

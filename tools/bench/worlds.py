@@ -1,6 +1,6 @@
-"""Parts that are measured in the same worlds: physics, perception, rendering, encoders; the part stream follows there. And benchmarks of
-physics alone: scaling with the number of equal workpieces, timed from DROP_TICKS ticks after they are dropped, without gripper; and with
-and without our replacements of Newton's components."""
+"""Benchmarks that share one simulation: physics, perception, rendering and encoders. Also benchmarks of physics alone: scaling with the
+number of identical workpieces without a gripper, timed from DROP_TICKS ticks after the drop, and the gain of our replacements of Newton's
+components."""
 
 import contextlib
 import resource

@@ -89,8 +89,8 @@ def measure_appearance(pixels: np.ndarray) -> Appearance:
 
 
 def compare_appearance(image: np.ndarray, twin: np.ndarray) -> float:
-    """Similarity of the appearance of two sets of pixels, by their features (n, 6), from 0 to 1: that of colours, which falls with the
-    Wasserstein distance of normal distributions with their means and covariances, times the ratio of details."""
+    """Appearance similarity of two sets of pixels, in [0, 1], from their features (n, 6): the product of a color term, which decreases with
+    the Wasserstein distance between Gaussians fitted to the colors, and the ratio of the standard deviations of detail."""
     (mean, covariance), (other, spread) = ((lab.mean(axis=1), np.cov(lab, bias=True)) for lab in (image.T[_LAB:], twin.T[_LAB:]))
     roots = np.sqrt(np.linalg.eigvals(covariance @ spread).real.clip(0.0)).sum()
     distance = np.sqrt(((mean - other) ** 2).sum() + max(0.0, np.trace(covariance + spread) - 2.0 * roots))

@@ -189,7 +189,7 @@ def _describe_image(sizes: tuple[Size, ...], color_format: str, scene: int, fram
 
 
 class CocoExporter(SceneExporter):
-    """`Exporter` of COCO. A scene is a folder of images, and a part of the annotations, from which a file a split is made at the end."""
+    """`Exporter` of COCO. A scene has a folder of images and an annotation part; parts are merged into a file per split at the end."""
 
     writes_depth = False
     staging = "coco"

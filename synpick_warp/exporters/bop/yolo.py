@@ -118,8 +118,8 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, split: str, f
 
 
 class YoloExporter(SceneExporter):
-    """`Exporter` of YOLO labels. A scene is a folder of images, one of each kind of labels, and a list of its images. The index of a class
-    is the rank of its obj_id."""
+    """`Exporter` of YOLO labels. Each scene has a folder of images, a folder per kind of label, and a list of its images. Class indices
+    follow the sorted obj_ids."""
 
     writes_depth = False
     staging = "yolo"

@@ -192,7 +192,7 @@ NORMALS, VALUES, OPACITY, GLOW = "_normal.png", "_values.png", "_opacity.png", "
 
 
 def write_texture(library: Path, name: str, material: Material) -> str | None:
-    """Write a material's texture, and its maps, into the asset library; returns the texture's path in the library, None without texture."""
+    """Write the texture and maps of a material to the asset library. Returns the texture's path in the library, or None."""
     if material.texture is None:
         return None
     file = texture_file(name)

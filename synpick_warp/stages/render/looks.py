@@ -262,7 +262,8 @@ def _record(kinds: np.ndarray, values: np.ndarray, looks: Looks, part: LookPart)
 SUN_CLEARANCE = 25.0
 """Lamps keep this angle from a set's sun [°], which takes in what is bright about it; nearer ones go to the opposite azimuth."""
 MAX_LAMPS = 4
-# x of the Planckian locus by 1000 K / T, and y by x (Kim et al., 2002): upper end of the range, coefficients of descending powers.
+# Planckian locus in CIE xy (Kim et al., 2002): piecewise polynomials for x as a function of 1000 K / T, and for y as a function of x. Each
+# piece: upper end of its range, coefficients from the highest power down.
 _LOCUS_X = ((4000.0, (-0.2661239, -0.2343589, 0.8776956, 0.179910)), (25000.0, (-3.0258469, 2.1070379, 0.2226347, 0.240390)))
 _LOCUS_Y = (
     (2222.0, (-1.1063814, -1.34811020, 2.18555832, -0.20219683)),

@@ -114,7 +114,7 @@ atexit.register(_server.stop)
 
 
 def start_server() -> None:
-    """Start the server before the first call, so that its imports (2 s) overlap with the caller's. Errors are left to that call."""
+    """Start the server before the first call, so that its imports (2 s) overlap with the caller's. The first call reports errors."""
     with _server._lock, contextlib.suppress(OSError):
         _server.start()
 
